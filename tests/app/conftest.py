@@ -14,8 +14,11 @@ from pathlib import Path
 
 import cv2
 import pytest
+import torch
 
 from torchslam.data import open_sequence
+from torchslam.data.trajectories import write_trajectory
+from torchslam.types import Trajectory
 
 VIDEO_FRAMES = 40
 
@@ -60,7 +63,10 @@ def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
 
 @pytest.fixture(scope="session")
 def video(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The first frames of the demo as a video, with a name that a careless page would execute; not in pictures."""
+    """The first frames of the demo as a video, and their true path beside it.
+
+    The video has a name that a careless page would execute, but not in pictures.
+    """
     name = "room.mp4" if "TORCHSLAM_PICTURES" in os.environ else "<img src=x onerror=alert(1)> {alert(2)}.mp4"
     path = tmp_path_factory.mktemp("video") / name
     sequence = open_sequence("synthetic:room", resize_to="320x240", limit=VIDEO_FRAMES)
@@ -69,6 +75,10 @@ def video(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for index in range(len(sequence)):
         film.write(cv2.cvtColor(sequence.color(index).numpy(), cv2.COLOR_RGB2BGR))
     film.release()
+    assert sequence.groundtruth is not None
+    times = torch.arange(VIDEO_FRAMES, dtype=torch.float64) / 15.0
+    truth = Trajectory(times, sequence.groundtruth.T_wc[:VIDEO_FRAMES])
+    write_trajectory(path.with_name("truth.txt"), truth)
     return plain.rename(path)
 
 

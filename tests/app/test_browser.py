@@ -87,22 +87,62 @@ def state_of(server: Server, title: str) -> State:
     return next(runs.state(name) for name in runs.names() if runs.record(name).title == title)
 
 
-def test_from_a_video_to_a_colmap_model_and_a_length(
-    page: Any, server: Server, video: Path, tmp_path: Path
-) -> None:
-    pycolmap = pytest.importorskip("pycolmap")
+@pytest.fixture(scope="module")
+def mapped(browser: Any, server: Server, video: Path) -> Path:
+    """The run of the video, which was started on the page."""
+    page = browser.new_page(viewport={"width": 1280, "height": 800})
+    page.goto(server.address)
     page.locator('input[data-kind="recording"]').set_input_files(video)
     page.get_by_text(f"{VIDEO_FRAMES} frames").wait_for(timeout=SLOW_MS)
     assert video.name in page.inner_text("body")  # as text, and nothing of it was executed
     page.get_by_role("button", name="Start").click()
     wait_for_state(page, video.name, "running")
     wait_for_end(page, server, video.name)
+    page.close()
+    runs = Runs(server.folder)
+    return next(runs.path(name) for name in runs.names() if runs.record(name).title == video.name)
 
+
+# The pixels at which vertices of a node of the scene are seen, and their number.
+PLACES = """([name, step]) => {
+  const {scene, camera, canvas} = window.__viserMutable, found = [], box = canvas.getBoundingClientRect();
+  let count = 0;
+  scene.traverse((node) => {
+    if (!node.geometry?.attributes.position || !node.parent?.parent?.name?.includes(name)) return;
+    const {array} = node.geometry.attributes.position;
+    for (let at = 0; at < array.length; at += 3 * step, count++) {
+      const seen = node.localToWorld(camera.position.clone().set(...array.slice(at, at + 3))).project(camera);
+      found.push([box.left + box.width * (1 + seen.x) / 2, box.top + box.height * (1 - seen.y) / 2]);
+    }
+  });
+  return [count, found];
+}"""
+
+
+def places(page: Any, name: str, step: int = 1) -> list[tuple[float, float]]:
+    """Where the vertices of a node are seen beside the panel, which is 390 wide; those in the middle first."""
+    _, found = page.evaluate(PLACES, [name, step])
+    inside = [(x, y) for x, y in found if 20 < x < 850 and 20 < y < 780]
+    return sorted(inside, key=lambda at: abs(at[0] - 440) + abs(at[1] - 400))
+
+
+def count(page: Any, name: str) -> int:
+    return int(page.evaluate(PLACES, [name, 1])[0])
+
+
+def test_a_length_is_measured_and_a_colmap_model_is_taken_away(
+    page: Any, server: Server, mapped: Path, tmp_path: Path
+) -> None:
+    pycolmap = pytest.importorskip("pycolmap")
     open_tab(page, "Measure")
     page.get_by_role("button", name="measure", exact=True).click()
     page.get_by_text("Click two points.").wait_for()
-    click_until(page, -1, "Click the second point.")
-    click_until(page, 1, "Length:")
+    wait_until(lambda: count(page, "points") > 50)
+    seen = places(page, "points")
+    page.mouse.click(*seen[0])
+    page.get_by_text("Click the second point.").wait_for()
+    page.mouse.click(*max(seen[:100], key=lambda at: abs(at[0] - seen[0][0]) + abs(at[1] - seen[0][1])))
+    page.get_by_text("Length:").wait_for()
     assert re.search(r"Length: [\d.]+ ± [\d.]+ map units", page.get_by_text("Length:").inner_text())
     draw(page, "app-measure")
     page.get_by_role("button", name="Set the length").click()
@@ -119,20 +159,42 @@ def test_from_a_video_to_a_colmap_model_and_a_length(
     model = pycolmap.Reconstruction(next(tmp_path.rglob("cameras.bin")).parent)
     assert model.num_reg_images() > 2
     assert model.num_points3D() > 50
-    assert not [
-        each for each in server.folder.parent.rglob("*") if "<img" in each.name
-    ]  # names are never paths
+    # Names are never paths.
+    assert not [each for each in server.folder.parent.rglob("*") if "<img" in each.name]
 
 
-def click_until(page: Any, side: int, words: str) -> None:
-    """Click at places of one half of the scene, from its middle outwards, until the panel has some words."""
-    offsets = [(side * 20.0 * x, 20.0 * y) for x in range(4, 14) for y in range(-6, 7)]
-    for x, y in sorted(offsets, key=lambda each: abs(each[1])):
-        page.mouse.click(445 + x, 400 + y)  # beside the panel, which is 390 wide
-        page.wait_for_timeout(300)
-        if page.get_by_text(words).count():
-            return
-    raise AssertionError(f"no point for: {words}")
+CAMERA = "() => { const {position, up} = window.__viserMutable.camera; return [...position, ...up]; }"
+
+
+def test_a_result_is_cropped_played_set_up_and_compared(page: Any, mapped: Path, video: Path) -> None:
+    wait_until(lambda: count(page, "points") > 50)
+    page.locator('input[data-kind="truth"]').set_input_files(video.with_name("truth.txt"))
+    page.get_by_text(re.compile(r"ATE 0\.0\d* m RMSE")).wait_for(timeout=SLOW_MS)
+    assert count(page, "other") > 1000
+
+    before = page.evaluate(CAMERA)
+    page.get_by_role("button", name="Play the path").click()
+    wait_until(lambda: page.evaluate(CAMERA)[:3] != before[:3], 30)
+    page.get_by_role("button", name="Play the path").click()
+    page.reload()  # from where all is seen
+    page.get_by_role("tab", name="Measure").click()
+    wait_until(lambda: count(page, "points") > 50)
+
+    page.mouse.click(*places(page, "frusta", 5)[0])
+    open_tab(page, "Result")
+    page.get_by_text(re.compile(r"frame \d+: \d+ points, median residual")).wait_for(timeout=SLOW_MS)
+
+    open_tab(page, "Measure")
+    page.get_by_role("button", name="set up").click()
+    page.get_by_text("Click a floor or a table.").wait_for()
+    page.mouse.click(*places(page, "points")[0])
+    wait_until(lambda: page.evaluate(CAMERA)[3:] != before[3:], 30)
+
+    whole = count(page, "points")
+    thumb = page.get_by_role("slider").first
+    for _ in range(3):
+        thumb.press("PageUp")
+    wait_until(lambda: 0 < count(page, "points") < whole, 30)
 
 
 @pytest.mark.slow  # a minute: the whole demo

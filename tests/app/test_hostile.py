@@ -92,10 +92,15 @@ def ask(
         connection.close()
 
 
-def begin(server: Server, size: int, count: int = 1) -> str:
-    status, _, content = ask(server, "POST", f"/uploads?size={size}&count={count}", b"")
+def announce(server: Server, *files: tuple[str, int]) -> str:
+    status, _, content = ask(server, "POST", "/uploads", json.dumps(files).encode())
     assert status == 200, content
     return str(json.loads(content)["id"])
+
+
+def send(server: Server, upload: str, content: bytes, kind: str = "recording") -> tuple[int, str]:
+    status, _, answer = ask(server, "PUT", f"/uploads/{upload}?kind={kind}", content)
+    return status, answer.decode()
 
 
 def works(server: Server) -> bool:
@@ -122,7 +127,7 @@ def test_requests_of_other_origins_and_by_other_names_are_refused(server: Server
     paths = [
         ("GET", "/"),
         ("GET", "/page.js"),
-        ("POST", "/uploads?size=1&count=1"),
+        ("POST", "/uploads"),
         ("POST", "/runs/x/colmap"),
     ]
     port, tried = server.port, 0
@@ -176,19 +181,17 @@ def test_without_the_token_nothing_is_answered(guarded: Server) -> None:
     for token in wrong:
         assert ask(guarded, "GET", f"/?token={quote(token)}")[0] == 401
         cookie = f"torchslam-token={token}".encode("latin-1").decode("latin-1")
-        for method, path in (("GET", "/"), ("POST", "/uploads?size=1&count=1"), ("GET", "/runs/x/colmap")):
+        for method, path in (("GET", "/"), ("POST", "/uploads"), ("GET", "/runs/x/colmap")):
             assert ask(guarded, method, path, b"", cookie=cookie)[0] == 401, (token, path)
     assert not asyncio.run(websocket(guarded))
-    assert (
-        ask(guarded, "POST", f"/uploads?token={guarded.token}&size=1&count=1", b"")[0] == 401
-    )  # only the page itself
+    assert ask(guarded, "POST", f"/uploads?token={guarded.token}", b"")[0] == 401  # only the page itself
     status, headers, _ = ask(guarded, "GET", f"/?token={guarded.token}", host="any.name")
     assert status == 303
     assert headers["location"] == "/"
     assert "HttpOnly" in headers["set-cookie"]
     cookie = headers["set-cookie"].partition(";")[0]
     assert ask(guarded, "GET", "/", cookie=cookie, host="any.name")[0] == 200
-    assert ask(guarded, "POST", "/uploads?size=2000000&count=1", b"", cookie=cookie)[0] == 422  # --max-upload
+    assert ask(guarded, "POST", "/uploads", b'[["a.mp4", 2000000]]', cookie=cookie)[0] == 422  # --max-upload
     assert ask(guarded, "GET", "/", cookie=cookie, origin="http://evil.example")[0] == 403
 
 
@@ -217,55 +220,59 @@ def test_names_of_runs_and_exports_are_never_paths(server: Server) -> None:
 
 
 def test_hostile_names_of_files_are_stored_as_plain_ones(server: Server) -> None:
-    before = {each for each in server.folder.parent.rglob("*") if ".uploads" not in each.parts}
+    def elsewhere() -> set[Path]:
+        return {each for each in server.folder.parent.rglob("*") if ".uploads" not in each.parts}
+
+    before = elsewhere()
     for name in HOSTILE_NAMES:
-        upload = begin(server, 1)
-        address = f"/uploads/{upload}/0?name={quote(name, errors='surrogatepass')}"
-        assert ask(server, "PUT", address, b"x")[0] == 200, name
-        (stored,) = (server.folder / ".uploads" / upload).iterdir()
-        assert stored.name.isascii()
-        assert stored.name.partition(".")[0] == "input"
-    assert {each for each in server.folder.parent.rglob("*") if ".uploads" not in each.parts} == before
-    assert len(list((server.folder / ".uploads").iterdir())) <= 20  # the oldest ones are deleted
+        for names in ([name], [name, name]):
+            upload = announce(server, *((each, 1) for each in names))
+            status, answer = send(server, upload, b"x" * len(names), "gps")
+            assert status == 200, (name, answer)
+            stored = list((server.folder / ".uploads" / upload).rglob("*"))
+            assert stored
+            assert all(each.name.isascii() and each.name[:3] in ("gps", "000") for each in stored), stored
+    assert elsewhere() == before
+    assert len(list((server.folder / ".uploads").iterdir())) == 1  # those before it are deleted
 
 
 def test_uploads_that_lie_about_themselves_are_refused_and_deleted(server: Server) -> None:
-    for query in (
-        "",
-        "size=1",
-        "size=-1&count=1",
-        "size=1&count=0",
-        "size=1&count=10001",
-        f"size={1 << 40}&count=1",
-    ):
-        assert ask(server, "POST", f"/uploads?{query}", b"")[0] == 422, query
-    for query in ("size=x&count=1", "size=1e9&count=1", "size=٣&count=1", "size=" + "9" * 400 + "&count=1"):
-        assert ask(server, "POST", f"/uploads?{quote(query, safe='=&')}", b"")[0] == 422, query
-    for path in (
-        "/uploads/nothing/0?name=x",
-        "/uploads/../0?name=x",
-        f"/uploads/{begin(server, 1)}/7?name=x",
-    ):
-        assert ask(server, "PUT", path, b"x")[0] in (404, 422), path
-    upload = begin(server, 3)
-    assert ask(server, "PUT", f"/uploads/{upload}/0?name=a.mp4", b"more than three")[0] == 422
-    assert not (server.folder / ".uploads" / upload).exists()
-    upload = begin(server, 3, count=2)
-    assert ask(server, "PUT", f"/uploads/{upload}/0?name=a.mp4", b"abc")[0] == 200
-    assert ask(server, "PUT", f"/uploads/{upload}/0?name=a.mp4", b"")[0] == 422  # a second time
-    upload = begin(server, 3, count=2)
-    assert ask(server, "POST", f"/uploads/{upload}/end?kind=recording", b"")[0] == 422  # nothing came
-    upload = begin(server, 1000)
+    lists = [
+        b"",
+        b"{}",
+        b"[]",
+        b"[1]",
+        b'["ab"]',
+        b'[["x"]]',
+        b'[["x", -1]]',
+        b'[["x", "1e9"]]',
+        b'[["x", null]]',
+        b'[["x", 1e999]]',
+    ]
+    lists += [
+        b"\xff",
+        b"[" * 100_000,
+        b'[["x", ' + b"9" * 5000 + b"]]",
+        json.dumps([["x", 1 << 40]]).encode(),
+    ]
+    lists += [json.dumps([["x", 1]] * 10_001).encode(), b" " * ((1 << 22) + 1)]
+    for content in lists:
+        assert ask(server, "POST", "/uploads", content)[0] == 422, content[:40]
+    kept = set((server.folder / ".uploads").iterdir())
+    for upload in ("nothing", "..", "%2e%2e", "a" * 32):
+        assert ask(server, "PUT", f"/uploads/{upload}?kind=gps", b"x")[0] in (404, 405, 422), upload
+    for sizes, content in (([3], b"more than three"), ([3], b"ab"), ([3, 2], b"abcd"), ([3, 2], b"")):
+        upload = announce(server, *(("a.mp4", size) for size in sizes))
+        assert send(server, upload, content, "gps")[0] == 422
+        assert send(server, upload, b"x" * sum(sizes), "gps")[0] == 422  # a second time
+    upload = announce(server, ("a.mp4", 1000))
     with socket.create_connection(("127.0.0.1", server.port)) as broken:
-        head = (
-            f"PUT /uploads/{upload}/0?name=a.mp4 HTTP/1.1\r\nhost: localhost\r\ncontent-length: 1000\r\n\r\n"
-        )
+        head = f"PUT /uploads/{upload}?kind=gps HTTP/1.1\r\nhost: localhost\r\ncontent-length: 1000\r\n\r\n"
         broken.sendall(head.encode() + b"only this")
         wait_until(lambda: any((server.folder / ".uploads" / upload).glob("*")), 20)
     wait_until(lambda: not (server.folder / ".uploads" / upload).exists(), 20)
-    upload = begin(server, 1)
-    ask(server, "PUT", f"/uploads/{upload}/0?name=a.mp4", b"x")
-    assert ask(server, "POST", f"/uploads/{upload}/end?kind=../x", b"")[0] == 422
+    assert send(server, announce(server, ("x", 1)), b"x", "../x")[0] == 422
+    assert set((server.folder / ".uploads").iterdir()) == kept
     assert works(server)
 
 
@@ -299,12 +306,11 @@ def link_archive() -> bytes:
     ids=["parent", "absolute", "link", "bomb", "truncated", "no archive"],
 )
 def test_hostile_archives_are_refused_with_the_message_of_the_reader(server: Server, content: bytes) -> None:
-    upload = begin(server, len(content))
-    assert ask(server, "PUT", f"/uploads/{upload}/0?name=holiday.zip", content)[0] == 200
-    status, _, answer = ask(server, "POST", f"/uploads/{upload}/end?kind=recording", b"")
+    upload = announce(server, ("holiday.zip", len(content)))
+    status, answer = send(server, upload, content)
     assert status == 422
     assert "holiday.zip" in json.loads(answer)["error"]
-    assert str(server.folder) not in answer.decode()
+    assert str(server.folder) not in answer
     assert not (server.folder / ".uploads" / upload).exists()
     assert not list(server.folder.parent.rglob("*escaped*"))
     assert not Path("/tmp/torchslam-escaped.png").exists()
@@ -336,7 +342,7 @@ def test_the_viewer_itself_accepts_no_connection_but_that_of_the_page(tmp_path: 
 
     viewer = viser.ViserServer("127.0.0.1", 0, verbose=False)
     nobody: Any = None
-    application(viewer, Uploads(tmp_path, 1), nobody)
+    application(viewer, nobody, Uploads(tmp_path, 1), nobody)
 
     async def received(**headers: str) -> int:
         address = f"ws://127.0.0.1:{viewer.get_port()}/"

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import json
+import os
 import signal
 import string
 import subprocess
 import sys
-import time
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -18,12 +17,19 @@ from hypothesis import strategies as st
 from tests.app.conftest import wait_until
 from torchslam.app import jobs
 from torchslam.app.exports import command_and_python, write_export, zip_folder
-from torchslam.app.jobs import DEMO, LOG, RECORD, Record, Runs, State
+from torchslam.app.jobs import DEMO, LOCK, LOG, RECORD, Record, Runs, State
 from torchslam.app.options import check_arguments
 from torchslam.errors import ConfigError, ResultsError
 from torchslam.io.file_names import CHECKPOINT, METRICS
 
-SLEEPS = "import time; print('torchslam: begun', flush=True); time.sleep(60)"
+SLEEPS = """
+import time
+print('torchslam: begun', flush=True)
+try:
+    time.sleep(60)
+except KeyboardInterrupt:
+    print('torchslam: interrupted', flush=True)
+"""
 
 
 @pytest.fixture
@@ -47,7 +53,6 @@ def test_one_run_goes_on_at_a_time_and_the_next_follows(runs: Runs) -> None:
     wait_until(lambda: runs.state(first) is not State.RUNNING, 20)
     runs.advance()
     assert runs.state(first) is State.STOPPED
-    assert runs.record(first).status == -signal.SIGINT
     assert runs.running() == second
     runs.stop(second)
     runs.resume(first)
@@ -77,11 +82,13 @@ def test_another_server_finds_a_run_that_goes_on_and_keeps_what_has_ended(runs: 
 
 
 def test_a_run_that_crashed_is_failed(runs: Runs) -> None:
-    name = runs.add("x", DEMO, ())
-    jobs.write_record(
-        runs.path(name), replace(runs.record(name), started=time.time(), status=-signal.SIGSEGV)
-    )
+    name = runs.add("x", DEMO)
+    runs.advance()
+    wait_until(lambda: "begun" in "".join(jobs.log_tail(runs.path(name))), 20)
+    os.kill(int((runs.path(name) / LOCK).read_text()), signal.SIGKILL)
+    wait_until(lambda: runs.running() is None, 20)
     assert runs.state(name) is State.FAILED
+    assert 0 <= runs.seconds(name) < 60
     runs.resume(name)
     assert runs.state(name) is State.QUEUED
 
@@ -140,7 +147,7 @@ def test_a_record_from_elsewhere_cannot_read_outside_or_run_code(
     with pytest.raises(ConfigError):
         check_arguments(arguments)
     name = runs.add("x", DEMO, ())
-    jobs.write_record(runs.path(name), Record("x", DEMO, arguments, queued=1.0))
+    jobs.write_record(runs.path(name), Record("x", DEMO, arguments))
     with pytest.raises(ConfigError):
         runs.advance()
     assert runs.state(name) is State.FAILED  # and the queue goes on
@@ -156,7 +163,7 @@ def test_a_record_from_elsewhere_runs_nothing_outside_of_the_folder(
     (tmp_path / "secret.mp4").write_bytes(b"x")
     name = runs.add("x", DEMO, ())
     (runs.folder / "link.mp4").symlink_to(tmp_path / "secret.mp4")
-    jobs.write_record(runs.path(name), Record("x", source, queued=1.0))
+    jobs.write_record(runs.path(name), Record("x", source))
     with pytest.raises(ResultsError, match="not in the folder"):
         runs.command(name)
 
@@ -168,7 +175,10 @@ def test_a_damaged_record_is_named_and_ends_nothing(runs: Runs, content: str) ->
     name = runs.add("x", DEMO, ())
     (runs.path(name) / RECORD).write_text(content)
     assert "damaged" in runs.record(name).title
-    assert runs.state(name) is State.STOPPED
+    assert runs.state(name) is State.QUEUED
+    with pytest.raises(ResultsError, match="not in the folder"):
+        runs.advance()
+    assert runs.state(name) is State.FAILED
 
 
 def test_progress_and_messages_are_read_from_the_log(tmp_path: Path) -> None:

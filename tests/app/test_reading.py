@@ -13,29 +13,21 @@ from tests.cli.conftest import finished
 from torchslam.app import reading
 from torchslam.errors import ResultsError
 from torchslam.io.results import TRAJECTORY, read_metrics, read_results
-from torchslam.io.viewer.page import decoded, encoded
 
 __all__ = ["finished"]
 
 
-@pytest.mark.parametrize("kind", ["float32", "float64", "uint8", "int8", "uint16", "int32"])
-def test_arrays_round_trip(kind: str) -> None:
-    values = np.arange(12).astype(kind).reshape(3, 4)
-    np.testing.assert_array_equal(decoded(encoded(values, kind)).reshape(3, 4), values)
-    assert decoded(encoded(values, kind)).dtype == values.dtype
-
-
 def test_a_result_has_the_data_of_the_page(finished: Path) -> None:
     data, metrics = reading.result(finished), read_metrics(finished)
-    submap = data["submaps"][0]
-    assert len(submap["poses"]) == 12 * metrics["posed"]
-    assert len(submap["keyframe_poses"]) == 12 * metrics["keyframes"]
+    submap = data["submap"]
+    assert submap["poses"].shape == (metrics["posed"], 3, 4)
+    assert submap["keyframe_poses"].shape == (metrics["keyframes"], 3, 4)
     assert submap["points"].dtype == np.float32
     assert data["summary"]["check"].endswith(metrics["check"]["sentence"])
-    assert data["timeline"].shape == (60, 600, 3)
-    frames = [int(data["frames"]["index"][row]) for row in submap["keyframe"]]
-    images = reading.thumbnails(finished, frames)
-    assert images.keys() == set(frames)
+    assert data["timeline"].shape == (260, 500, 3)
+    frames = submap["frames"].tolist()
+    images = submap["images"]
+    assert images.keys() == set(range(len(frames)))
     assert all(max(image.shape) == reading.THUMBNAIL_SIDE for image in images.values())
     drawn, words = reading.residuals(finished, frames[0])
     assert drawn.shape[2] == 3
@@ -44,22 +36,12 @@ def test_a_result_has_the_data_of_the_page(finished: Path) -> None:
 
 
 def test_a_path_is_the_same_as_itself_and_close_to_the_truth(finished: Path) -> None:
-    positions, words = reading.compared(finished, finished / TRAJECTORY, False)
-    submap = reading.result(finished)["submaps"][0]
-    np.testing.assert_allclose(positions, submap["poses"].reshape(-1, 3, 4)[:, :, 3], atol=1e-4)
+    submap = reading.result(finished)["submap"]
+    positions, words = reading.compared(finished, finished / TRAJECTORY, False, submap["S_shown_map"])
+    np.testing.assert_allclose(positions, submap["poses"][:, :, 3], atol=1e-4)
     assert float(words.split()[1]) < 1e-6
-    _, words = reading.compared(finished, finished / "groundtruth.txt", True)
+    _, words = reading.compared(finished, finished / "groundtruth.txt", True, submap["S_shown_map"])
     assert words.startswith(f"ATE {read_metrics(finished)['ate_m']:.4g} m RMSE")
-
-
-def test_the_timeline_has_states_and_breaks() -> None:
-    states = np.array([0, 1, 1, 2, 3, 1])
-    image = reading.timeline(states, np.array([0, 50, 100, 100, 0, 100]), np.arange(6) * 10, [30])
-    row = image[-1, 50::100]
-    np.testing.assert_array_equal(row, np.array(reading.STATE_COLORS)[states])
-    assert (image[0, 300] == reading.BREAK_COLOR).all()
-    assert (image[0, 150] == 245).all()  # half as high
-    assert reading.timeline(np.zeros(0, int), np.zeros(0, int), np.zeros(0, int), []).shape == (60, 600, 3)
 
 
 def crash(folder: Path) -> None:
@@ -95,7 +77,7 @@ class TestMeasures:
         return scene
 
     def test_the_length_of_two_points_has_their_errors(self, finished: Path) -> None:
-        submap = reading.result(finished)["submaps"][0]
+        submap = reading.result(finished)["submap"]
         results = read_results(finished)
         slam_map = results.map
         ids = slam_map.valid_points()
@@ -113,7 +95,7 @@ class TestMeasures:
         assert std == pytest.approx(expected_std, rel=0.02)
         unknown = submap | {"error_step": np.zeros_like(submap["error_step"])}
         assert np.isnan(self.code.length_between(unknown, rows)[1])
-        click = self.code.click_of(submap, (640, 480), rows[0])
+        click = self.code.click_of(submap, rows[0])
         assert click is not None
         frame, _, pixel = click.partition(":")
         assert int(frame) in range(16)
@@ -140,11 +122,12 @@ class TestMeasures:
         assert normal @ [0, 0, 1] > np.cos(np.radians(1))
         assert self.code.plane_normal(floor, 0, np.array([0.0, 0, -3])) @ [0, 0, 1] < 0
 
-    def test_frusta_are_eight_edges_each(self) -> None:
-        pose = np.eye(3, 4)[None] + np.array([0, 0, 0, 1.0])
-        edges = self.code.outlines(pose, np.array([[-1.0, -1, 1], [1, -1, 1], [1, 1, 1], [-1, 1, 1]]))
-        assert edges.shape == (8, 2, 3)
-        assert (edges[:4, 0] == 1).all()
-        np.testing.assert_array_equal(edges[4:, 0], edges[:4, 1])
-        assert self.code.strip(np.zeros((0, 3))).shape == (0, 2, 3)
-        assert self.code.spread(10, 4).tolist() == [0, 3, 6, 9]
+    def test_a_path_is_drawn_by_points_along_its_steps_and_none_across_a_break(self) -> None:
+        path = np.array([[0.0, 0, 0], [1, 0, 0], [5, 5, 5], [5, 5, 8]])
+        points, ends = self.code.beads(path, np.array([True, False, True]))
+        on_first, on_last = (points[:, 1:] == 0).all(axis=1), (points[:, :2] == 5).all(axis=1)
+        assert (on_first | on_last).all()
+        assert on_last.mean() == pytest.approx(0.75, abs=0.01)  # by length
+        np.testing.assert_array_equal(ends[on_last], 3)
+        for few in range(2):
+            assert self.code.beads(path[:few], np.ones(0, bool))[0].shape == (few, 3)

@@ -44,7 +44,7 @@ from torchslam.io.export.nerfstudio import write_nerfstudio
 from torchslam.io.export.ply import read_cloud, upright_from_map, write_map_cloud
 from torchslam.io.export.scene import scene_of, undistorted
 from torchslam.io.results import read_results
-from torchslam.io.viewer.page import page, page_data
+from torchslam.io.viewer.page import encoded, page, page_data
 from torchslam.map.atlas import Submap
 from torchslam.map.file import read_atlas, write_atlas
 from torchslam.map.posed_frames import RunGraph
@@ -350,7 +350,7 @@ def _graph(root: Path) -> object:
 
 def _results(root: Path) -> str:
     results = read_results(root)
-    strict_json(json.dumps(page_data(results)))
+    strict_json(json.dumps(page_data(results), default=encoded))
     return page(results)
 
 

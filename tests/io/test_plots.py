@@ -130,6 +130,12 @@ def test_spans_without_a_certain_pose_are_shaded(results: list[StepResult]) -> N
     assert len({patch.get_facecolor() for patch in spans.values()}) == 3
 
 
+def test_breaks_of_the_check_are_marked(results: list[StepResult]) -> None:
+    axes = plots.plot_tracking(results, breaks=["the path breaks between frames 6 and 7"]).axes[0]
+    (marks,) = [each for each in axes.collections if each.get_label() == "break"]
+    assert [segment[0][0] for segment in marks.get_segments()] == pytest.approx([6 / 30])
+
+
 def test_error_picture_states_the_rmse(results: list[StepResult]) -> None:
     seconds = torch.tensor([100.0, 100.5, 101.0], dtype=torch.float64)
     figure = plots.plot_errors(seconds, torch.tensor([0.3, 0.4, 0.0]), None, results)

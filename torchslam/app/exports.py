@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import shlex
 import shutil
+import tempfile
 import threading
 import zipfile
 from collections.abc import Sequence
@@ -12,27 +13,25 @@ from pathlib import Path
 
 from torchslam.app.jobs import INPUT, LOCK, LOG, RECORD, tool
 from torchslam.errors import ResultsError
-from torchslam.io.file_names import DENSE_CLOUD, MESH, METRICS, POINT_CLOUD, TRAJECTORY
+from torchslam.io.file_names import DENSE_CLOUD, EXAMPLE_IMAGE, MESH, METRICS, POINT_CLOUD, TRAJECTORY
 
-FOLDER = "taken"  # in the results folder: written on demand, and again when the results have changed
-VIEW = "view.html"  # as `page.VIEW`, whose module needs torch
+TAKEN = "taken"  # folder of the zips, in the results folder: written again when the results have changed
 FREE = 1 << 30  # bytes of the disk that uploads and exports leave free
-FILES = {
-    "ply": ("sparse cloud (PLY)", POINT_CLOUD),
-    "dense": ("dense cloud (PLY)", DENSE_CLOUD),
-    "mesh": ("mesh (PLY)", MESH),
-    "tum": ("path, TUM", TRAJECTORY),
-    "view": ("view.html, to share", VIEW),
+EXPORTS: dict[str, tuple[str, str, Sequence[str]]] = {
+    "colmap": ("COLMAP (zip)", "", ("--to", "colmap")),
+    "nerfstudio": ("nerfstudio (zip)", "", ("--to", "nerfstudio")),
+    "splat": ("3D Gaussian splatting (zip)", "", ("--to", "colmap", "--undistort")),
+    "kitti": ("path, KITTI (zip)", "", ("--to", "kitti")),
+    "all": ("all results (zip)", "", ()),
+    "ply": ("sparse cloud (PLY)", POINT_CLOUD, ()),
+    "dense": ("dense cloud (PLY)", DENSE_CLOUD, ()),
+    "mesh": ("mesh (PLY)", MESH, ("--to", "mesh")),
+    "tum": ("path, TUM", TRAJECTORY, ()),
+    "view": ("view.html, to share", "view.html", ()),
+    "picture": ("", EXAMPLE_IMAGE, ()),
 }
-"""Files of the results folder: label and name."""
-ZIPS: dict[str, tuple[str, Sequence[str]]] = {
-    "colmap": ("COLMAP (zip)", ("--to", "colmap")),
-    "nerfstudio": ("nerfstudio (zip)", ("--to", "nerfstudio")),
-    "splat": ("3D Gaussian splatting (zip)", ("--to", "colmap", "--undistort")),
-    "kitti": ("path, KITTI (zip)", ("--to", "kitti")),
-    "all": ("all results (zip)", ()),
-}
-"""Zips: label and arguments of `torchslam export`; without any, of the results folder itself."""
+"""Label, none for the picture of a run in the list; file of the results folder, none for a zip; and arguments of
+`torchslam export` that write it."""
 _writing = threading.Lock()
 
 
@@ -44,27 +43,25 @@ def check_disk(folder: Path, size: int = 0) -> None:
 
 def write_export(path: Path, kind: str) -> Path:
     """Return the file of an export of a results folder, which is written unless it is there. Raises ResultsError."""
-    if kind not in FILES | ZIPS or not (path / METRICS).is_file():
+    if kind not in EXPORTS or not (path / METRICS).is_file():
         raise ResultsError("there is no such export, or the run has no results yet")
+    _, name, words = EXPORTS[kind]
+    file = path / (name or f"{TAKEN}/{kind}.zip")
     with _writing:
-        if kind in FILES:
-            file = path / FILES[kind][1]
-            if kind == "mesh" and not file.is_file():
-                check_disk(path)
-                tool(["export", str(path), "--to", "mesh", "--output", str(file), "--overwrite"], path.parent)
-            if not file.is_file():
-                raise ResultsError(
-                    f"the run wrote no {file.name}" + (": run it with Dense" if kind == "dense" else "")
-                )
+        is_old = not name and file.exists() and file.stat().st_mtime < (path / METRICS).stat().st_mtime
+        if file.is_file() and not is_old:
             return file
-        target, (_, words) = path / FOLDER / f"{kind}.zip", ZIPS[kind]
-        if not target.exists() or target.stat().st_mtime < (path / METRICS).stat().st_mtime:
-            check_disk(path)
-            source = path / FOLDER / kind if words else path
+        check_disk(path)
+        if not words and name:
+            hint = ": run it with Dense" if kind == "dense" else ""
+            raise ResultsError(f"the run wrote no {name}{hint}")
+        with tempfile.TemporaryDirectory(dir=path, prefix=TAKEN) as written:
+            target = str(file) if name else written
             if words:
-                tool(["export", str(path), *words, "--output", str(source), "--overwrite"], path.parent)
-            zip_folder(source, target)
-        return target
+                tool(["export", str(path), *words, "--output", target, "--overwrite"], path.parent)
+            if not name:
+                zip_folder(Path(written) if words else path, file)
+    return file
 
 
 def zip_folder(source: Path, target: Path) -> None:
@@ -73,12 +70,10 @@ def zip_folder(source: Path, target: Path) -> None:
     part = target.with_suffix(".part")
     with zipfile.ZipFile(part, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
         for file in sorted(source.rglob("*")):
-            inside = file.relative_to(source)
-            is_own = (
-                inside.parts[0] in (RECORD, LOG, LOCK, FOLDER) or inside.parts[0].partition(".")[0] == INPUT
-            )
+            top = file.relative_to(source).parts[0]
+            is_own = top in (RECORD, LOG, LOCK) or top.startswith(TAKEN) or top.partition(".")[0] == INPUT
             if file.is_file() and not file.is_symlink() and not is_own:
-                archive.write(file, inside)
+                archive.write(file, file.relative_to(source))
     part.replace(target)
 
 
@@ -87,26 +82,28 @@ def links(address: str) -> str:
     style = "display:block;margin:4px 12px;cursor:pointer;color:#1864ab;font-size:0.875em"
     return "".join(
         f'<a role="button" style="{style}" data-take="{label}" data-address="{address}/{kind}">{label}</a>'
-        for kind, (label, _) in (ZIPS | FILES).items()
+        for kind, (label, _, _) in EXPORTS.items()
+        if label
     )
 
 
 def command_and_python(words: list[str], folder: Path) -> str:
     """The command line of a run, and lines of Python that do the same; paths are relative to `folder`."""
     plain = [word.replace(f"{folder}/", "") for word in words]
-    given = dict(itertools.pairwise(plain))
-    stride = given.get("--stride", 1)
-    settings = [after for word, after in itertools.pairwise(plain) if word == "--set"]
-    for flag, name in (("--marker", "marker"), ("--camera-height", "camera_height"), ("--gps", "gps")):
+    pairs = list(itertools.pairwise(plain))
+    given = dict(pairs)
+    settings = [after for word, after in pairs if word == "--set"]
+    for name in ("marker", "camera_height", "gps"):
+        flag = "--" + name.replace("_", "-")
         settings += [f"metric.{name}={given[flag]}"] if flag in given else []
-    lines = [
-        "import torchslam",
-        f"sequence = torchslam.open_sequence({plain[1]!r}, {given.get('--camera')!r}, stride={stride})",
-        f"config = torchslam.load_config(None, {settings!r})",
-        f"run = torchslam.run(sequence, config, mapping={given.get('--mapping', 'auto')!r})",
-        "if run.check is not None:",
-        "    print(run.check.sentence())",
-        "print(run.camera.params, run.trajectory.positions_w.shape)",
-        "points = run.map.positions_w[run.map.valid_points()]",
-    ]
-    return shlex.join(["torchslam", *plain]) + "\n\n" + "\n".join(lines)
+    stride, camera, mapping = given.get("--stride", 1), given.get("--camera"), given.get("--mapping", "auto")
+    return f"""{shlex.join(["torchslam", *plain])}
+
+import torchslam
+sequence = torchslam.open_sequence({plain[1]!r}, {camera!r}, stride={stride})
+config = torchslam.load_config(None, {settings!r})
+run = torchslam.run(sequence, config, mapping={mapping!r})
+if run.check is not None:
+    print(run.check.sentence())
+print(run.camera.params, run.trajectory.positions_w.shape)
+points = run.map.positions_w[run.map.valid_points()]"""

@@ -18,26 +18,27 @@ import sys
 import threading
 import time
 import unicodedata
-from collections.abc import Iterable, Sequence
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import asdict, dataclass
 from enum import StrEnum
 from pathlib import Path
+from typing import Any
 
 from torchslam.app.options import check_arguments
-from torchslam.errors import ResultsError
+from torchslam.errors import ResultsError, TorchslamError
 from torchslam.io.file_names import CHECKPOINT, METRICS, STAGES
 from torchslam.utils.console import printable
 from torchslam.utils.files import JSON_BYTES, parse_json, read_text, write_whole
 
 DEMO = "synthetic:room"
-RECORD, LOG, LOCK = "app.json", "run.log", "app.lock"  # in the folder of a run
+# In the folder of a run: see `Record`; its messages; held while it goes on, with its process; there while it waits.
+RECORD, LOG, LOCK, QUEUE = "app.json", "run.log", "app.lock", "app.queue"
 INPUT = "input"  # file without its suffix, or folder, of what was uploaded
+INTERRUPTED = "torchslam: interrupted"  # the last message of a run that was stopped, as of `cli.main`
 MAX_QUEUED = 20  # runs that wait; more are a mistake
 MAX_TITLE = 120  # characters of a file name that are shown
 LOG_TAIL = 1 << 14  # bytes of the log that are shown: about 100 lines
 TOOL_S = 1800.0  # seconds after which a command on a finished run is ended; tried at this value only
-# None: of another server's run.
-STOPPED_STATUS = (None, 130, 143, -signal.SIGINT, -signal.SIGTERM, -signal.SIGKILL)
 
 
 class State(StrEnum):
@@ -58,34 +59,27 @@ class Record:
         title: the name of the uploaded file, only to be shown.
         source: what is run: a path below the folder of all runs, or `DEMO`.
         arguments: the other arguments of `torchslam run`.
-        queued, started, ended: seconds since 1970; 0 before.
-        status: exit status of the last process; None before, or if it is unknown.
-        pid: of the last process, valid while the lock is held.
     """
 
     title: str
     source: str
     arguments: tuple[str, ...] = ()
-    queued: float = 0.0
-    started: float = 0.0
-    ended: float = 0.0
-    status: int | None = None
-    pid: int = 0
 
 
 class Runs:
     """The runs of a folder and their queue; with `max_runs` folders no run is added."""
 
     def __init__(self, folder: Path, max_runs: int = 100) -> None:
-        self.folder, self._max_runs = folder.absolute(), max_runs
+        self.folder, self._max_runs, self._lock = folder.absolute(), max_runs, threading.RLock()
         self.folder.mkdir(parents=True, exist_ok=True)
-        self._lock = threading.RLock()
-        self._current: tuple[str, subprocess.Popen[bytes]] | None = None
+        self._process: subprocess.Popen[bytes] | None = None
 
     def names(self) -> list[str]:
         """The names of all runs, the latest first, also of those that were started elsewhere."""
         found = [each for each in self.folder.iterdir() if is_run(each)]
-        return [each.name for each in sorted(found, key=_time_of, reverse=True)]
+        return [
+            each.name for each in sorted(found, key=lambda path: time_of(path / RECORD, path), reverse=True)
+        ]
 
     def path(self, name: str) -> Path:
         """The folder of a run. Raises ResultsError for a name that is none of a run."""
@@ -105,14 +99,22 @@ class Runs:
 
     def state(self, name: str) -> State:
         """The state of a run, from its folder."""
-        path, record = self.path(name), self.record(name)
+        path = self.path(name)
         if is_held(path):
             return State.RUNNING
-        if record.queued and not record.started:
+        if (path / QUEUE).exists():
             return State.QUEUED
-        if (path / METRICS).exists() and not is_begun(path):
+        if is_begun(path):
+            return State.STOPPED
+        if (path / METRICS).exists():
             return State.DONE
-        return State.STOPPED if is_begun(path) or record.status in STOPPED_STATUS else State.FAILED
+        return State.STOPPED if (log_tail(path) or [INTERRUPTED])[-1] == INTERRUPTED else State.FAILED
+
+    def seconds(self, name: str) -> float:
+        """How long the process of a run has gone on, or went on; 0 before."""
+        path = self.path(name)
+        end = time.time() if is_held(path) else time_of(path / LOG)
+        return max(0.0, end - time_of(path / LOCK)) if (path / LOCK).exists() else 0.0
 
     def running(self) -> str | None:
         """The name of the run that goes on."""
@@ -122,7 +124,7 @@ class Runs:
         self,
         title: str,
         source: str,
-        arguments: Iterable[str],
+        arguments: Iterable[str] = (),
         upload: Path | None = None,
         files: Iterable[Path] = (),
     ) -> str:
@@ -135,43 +137,39 @@ class Runs:
             check_arguments(arguments)
             if len(names) >= self._max_runs:
                 raise ResultsError(
-                    f"{len(names)} runs in the folder: delete some, or start with a larger --max-runs"
+                    f"{len(names)} runs in the folder: delete some, or use a larger --max-runs"
                 )
-            if sum(self.state(name) is State.QUEUED for name in names) >= MAX_QUEUED:
+            if len(list(self.folder.glob(f"*/{QUEUE}"))) >= MAX_QUEUED:
                 raise ResultsError(f"{MAX_QUEUED} runs wait already")
-            stem, number = f"{time.strftime('%Y%m%d-%H%M%S')}-{slug(Path(title).stem)}", 1
-            while (path := self.folder / (stem if number == 1 else f"{stem}-{number}")).exists():
-                number += 1
+            stem = f"{time.strftime('%Y%m%d-%H%M%S')}-{slug(Path(title).stem)}"
+            paths = (self.folder / (stem + end) for end in ("", *(f"-{n}" for n in range(2, 100))))
+            path = next(path for path in paths if not path.exists())
             path.mkdir()
             if upload is not None:
                 upload.rename(path / upload.name)
                 source = f"{path.name}/{upload.name}"
             for each in files:
                 shutil.copyfile(each, path / each.name)
-            write_record(path, Record(shown(title), source, arguments, queued=time.time()))
+            write_record(path, Record(shown(title), source, arguments))
+            (path / QUEUE).touch()
         return path.name
 
     def resume(self, name: str) -> None:
         """Queue a run again, which goes on from its checkpoint, or begins anew without one."""
         with self._lock:
-            record = self.record(name)
-            if self.state(name) not in (State.STOPPED, State.FAILED):
-                raise ResultsError(f"{record.title} is {self.state(name)}")
-            write_record(
-                self.path(name), replace(record, queued=time.time(), started=0.0, ended=0.0, status=None)
-            )
+            if (state := self.state(name)) not in (State.STOPPED, State.FAILED):
+                raise ResultsError(f"{self.record(name).title} is {state}")
+            (self.path(name) / QUEUE).touch()
 
     def stop(self, name: str) -> None:
         """End a run, which writes what it has; a queued one leaves the queue. Nothing for one that has ended."""
         with self._lock:
-            record, state = self.record(name), self.state(name)
-            if state is State.RUNNING and record.pid > 0:
+            path, state = self.path(name), self.state(name)
+            if state is State.QUEUED:
+                (path / QUEUE).unlink()
+            elif state is State.RUNNING:
                 with contextlib.suppress(ProcessLookupError):  # it has just ended
-                    os.kill(record.pid, signal.SIGINT)
-            elif state is State.QUEUED:
-                write_record(
-                    self.path(name), replace(record, started=time.time(), ended=time.time(), status=130)
-                )
+                    os.kill(int((path / LOCK).read_text()), signal.SIGINT)
 
     def delete(self, name: str) -> None:
         """Delete a run with all of its files. Raises ResultsError for one that goes on."""
@@ -182,17 +180,15 @@ class Runs:
             shutil.rmtree(path)
 
     def advance(self) -> None:
-        """Note the end of the process, and start the next run of the queue if none goes on."""
+        """Start the next run of the queue if none goes on."""
         with self._lock:
-            if self._current is not None and self._current[1].poll() is not None:
-                name, process = self._current
-                if name in self.names():
-                    ended = replace(self.record(name), ended=time.time(), status=process.returncode)
-                    write_record(self.path(name), ended)
-                self._current = None
-            waiting = [name for name in self.names() if self.state(name) is State.QUEUED]
-            if waiting and self._current is None and self.running() is None:
-                self._start(min(waiting, key=lambda name: self.record(name).queued))
+            waiting = [path for path in self.folder.glob(f"*/{QUEUE}") if is_run(path.parent)]
+            if self._process is not None and self._process.poll() is None:
+                return
+            if waiting and self.running() is None:
+                first = min(waiting, key=time_of)
+                first.unlink()
+                self._start(first.parent.name)
 
     def command(self, name: str) -> list[str]:
         """The words after `torchslam` of the command of a run, with absolute paths.
@@ -209,24 +205,27 @@ class Runs:
         return ["run", source, "--output", str(self.path(name)), *record.arguments]
 
     def _start(self, name: str) -> None:
-        path, record = self.path(name), replace(self.record(name), started=time.time())
-        write_record(path, replace(record, ended=record.started, status=2))  # if it cannot be started
-        words = [*self.command(name), "--live", "--resume" if is_begun(path) else "--overwrite"]
+        path, options = self.path(name), dict[str, Any](stdin=subprocess.DEVNULL, start_new_session=True)
         environment = os.environ | {"TORCHSLAM_LOG_INTERVAL": "1", "PYTHONUNBUFFERED": "1"}
-        with (path / LOG).open("ab") as log, (path / LOCK).open("ab") as lock:
-            fcntl.flock(lock, fcntl.LOCK_EX)  # held by the process and its workers until all have ended
-            process = subprocess.Popen(
-                [sys.executable, "-m", "torchslam", *words],
-                stdin=subprocess.DEVNULL,
-                stdout=log,
-                stderr=log,
-                cwd=path,
-                env=environment,
-                pass_fds=(lock.fileno(),),
-                start_new_session=True,
-            )
-        self._current = name, process
-        write_record(path, replace(record, ended=0.0, status=None, pid=process.pid))
+        # The lock is held by the process and its workers until all have ended.
+        with (path / LOG).open("ab") as log, locked(path / LOCK) as lock:
+            options |= {"stdout": log, "stderr": log, "cwd": path, "env": environment, "pass_fds": [lock]}
+            try:
+                words = [*self.command(name), "--live", "--resume" if is_begun(path) else "--overwrite"]
+                self._process = subprocess.Popen([sys.executable, "-m", "torchslam", *words], **options)
+            except (TorchslamError, OSError) as error:
+                log.write(f"torchslam: error: {error}\n".encode())
+                raise
+            os.truncate(lock, 0)
+            os.write(lock, str(self._process.pid).encode())
+
+
+@contextlib.contextmanager
+def locked(path: Path) -> Iterator[int]:
+    """Hold a lock, and yield its file's number. Raises BlockingIOError if another process holds it."""
+    with path.open("ab") as file:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        yield file.fileno()
 
 
 def tool(words: Sequence[str], folder: Path, title: str = "", timeout_s: float = TOOL_S) -> str:
@@ -235,22 +234,14 @@ def tool(words: Sequence[str], folder: Path, title: str = "", timeout_s: float =
     Raises ResultsError with its message, in which `title` stands for files below the folder.
     """
     command = [sys.executable, "-m", "torchslam", *words]
+    options: dict[str, Any] = {"text": True, "errors": "replace", "timeout": timeout_s}
     try:
-        done = subprocess.run(
-            command,
-            stdin=subprocess.DEVNULL,
-            capture_output=True,
-            text=True,
-            errors="replace",
-            timeout=timeout_s,
-        )
+        done = subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, **options)
     except subprocess.TimeoutExpired:
         raise ResultsError(f"torchslam {words[0]} took more than {timeout_s:.0f} s and was ended") from None
     if done.returncode == 0:
-        return done.stdout
-    lines = [line for line in done.stderr.splitlines() if line.strip()] or [
-        f"ended with status {done.returncode}"
-    ]
+        return str(done.stdout)
+    lines = [line for line in done.stderr.splitlines() if line.strip()] or [f"status {done.returncode}"]
     errors = [line for line in lines if line.startswith("torchslam: error: ")]
     text = (errors or lines)[-1].removeprefix("torchslam: ").removeprefix("error: ")
     below = re.escape(str(folder)) + r"/[^\s:'\"]*"
@@ -270,26 +261,28 @@ def is_begun(path: Path) -> bool:
 
 def is_held(path: Path) -> bool:
     """Whether a process of the run in a folder goes on."""
-    try:
-        with (path / LOCK).open("rb") as lock:
+    with contextlib.suppress(FileNotFoundError), (path / LOCK).open("rb") as lock:  # or just deleted
+        try:
             fcntl.flock(lock, fcntl.LOCK_SH | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return True
-    except FileNotFoundError:  # no run of the page, or just deleted
-        pass
+        except BlockingIOError:
+            return True
     return False
+
+
+def time_of(*paths: Path) -> float:
+    """When the first of the paths that is there was written, seconds since 1970; 0 without one."""
+    for path in paths:
+        with contextlib.suppress(FileNotFoundError):  # it may just be deleted
+            return path.stat().st_mtime
+    return 0.0
 
 
 def read_record(path: Path) -> Record:
     """Read app.json; of results from elsewhere, and where it is damaged, the title names the folder."""
     try:
         content = parse_json(read_text(path / RECORD, JSON_BYTES, "a record"))
-        record = Record(**content | {"arguments": tuple(map(str, content["arguments"]))})
-        (
-            float(record.queued + record.started + record.ended + record.pid),
-            str.strip(record.title + record.source),
-        )
-        return record
+        words = tuple(map(str, content["arguments"]))
+        return Record(str(content["title"]), str(content["source"]), words)
     except FileNotFoundError:
         return Record(shown(path.name), "")
     except (OSError, ValueError, TypeError, KeyError):
@@ -335,9 +328,3 @@ def stored_name(name: str, stem: str = INPUT) -> str:
 def shown(name: str) -> str:
     """The name of a file as it is shown: without folders and control characters, not too long."""
     return printable(name.replace("\\", "/").rpartition("/")[2])[:MAX_TITLE] or "recording"
-
-
-def _time_of(path: Path) -> float:
-    with contextlib.suppress(FileNotFoundError):  # it was just deleted
-        return read_record(path).queued or path.stat().st_mtime
-    return 0.0

@@ -54,11 +54,9 @@ class Options:
     """The options in the panel."""
 
     def __init__(self, gui: viser.GuiApi) -> None:
-        about = descriptions(MetricConfig)
-        self._files = dict[str, Path]()
-        cameras = (UNKNOWN, FILE, *PRESETS.split(", "))
+        about, self._gui, self._files = descriptions(MetricConfig), gui, dict[str, Path]()
         hint = "unknown: that of the recording, if it states one, else estimated from the images"
-        self._camera = gui.add_dropdown("Camera", cameras, hint=hint)
+        self._camera = gui.add_dropdown("Camera", (UNKNOWN, FILE, *PRESETS.split(", ")), hint=hint)
         self._stride = gui.add_number("Every N-th frame", 1, min=1, max=1000, step=1)
         hint = "auto: frame by frame, as a whole where that fails; online: frame by frame; global: always as a whole"
         self._mapping = gui.add_dropdown("Mapping", MAPPINGS, hint=hint)
@@ -67,79 +65,76 @@ class Options:
         self._marker = gui.add_text("Marker", "aruco-4x4:0.10", hint=about["marker"])
         self._height = gui.add_number("Height, m", 1.5, min=0.01, max=1000, hint=about["camera_height"])
         self._uploads = {kind: gui.add_html("") for kind in FILE_KINDS}
-        self._camera.on_update(lambda _: self._show())
-        self._meters.on_update(lambda _: self._show())
+        for each in (self._camera, self._meters):
+            each.on_update(lambda _: self._show())
         self._settings = dict[str, tuple[Any, Any]]()  # widget and default by full name
         with gui.add_folder("Settings", expand_by_default=False):
-            self._add_settings(gui, Config())
+            self._add_settings(Config())
         self._show()
 
     def take(self, kind: str, path: Path) -> None:
         """Use an uploaded file for an option."""
         self._files[kind] = path
-        if kind == "camera":
-            self._camera.value = FILE
-        else:
-            self._meters.value = GPS
+        (self._camera if kind == "camera" else self._meters).value = FILE_KINDS[kind]
         self._show()
 
     def arguments(self) -> tuple[list[str], list[Path]]:
         """The arguments of the run, and the uploaded files that they name. Raises ConfigError if a file is missing."""
-        used = [
-            kind for kind, choice in FILE_KINDS.items() if choice in (self._camera.value, self._meters.value)
-        ]
+        camera, meters = self._camera.value, self._meters.value
+        used = [kind for kind, choice in FILE_KINDS.items() if choice in (camera, meters)]
         if missing := [kind for kind in used if kind not in self._files]:
             raise ConfigError(f"choose the {missing[0]} file first")
-        words = ["--mapping", self._mapping.value, "--stride", f"{self._stride.value:.0f}"]
-        camera, meters = self._camera.value, self._meters.value
-        if camera != UNKNOWN:
-            words += ["--camera", self._files["camera"].name if camera == FILE else camera]
-        words += ["--dense"] if self._dense.value else []
-        words += ["--marker", self._marker.value] if meters == MARKER else []
-        words += ["--camera-height", f"{self._height.value:g}"] if meters == HEIGHT else []
-        words += ["--gps", self._files["gps"].name] if meters == GPS else []
+        given = {
+            "--mapping": self._mapping.value,
+            "--stride": f"{self._stride.value:.0f}",
+            "--camera": self._files["camera"].name
+            if camera == FILE
+            else None
+            if camera == UNKNOWN
+            else camera,
+            "--marker": self._marker.value if meters == MARKER else None,
+            "--camera-height": f"{self._height.value:g}" if meters == HEIGHT else None,
+            "--gps": self._files["gps"].name if meters == GPS else None,
+        }
+        words = [word for flag, value in given.items() if value is not None for word in (flag, value)]
         for name, (widget, default) in self._settings.items():
-            if widget.value != default:
-                words += [
-                    "--set",
-                    f"{name}={str(widget.value).lower() if isinstance(default, bool) else widget.value}",
-                ]
-        return words, [self._files[kind] for kind in used]
+            value = str(widget.value).lower() if isinstance(default, bool) else widget.value
+            words += ["--set", f"{name}={value}"] if widget.value != default else []
+        return [*words, *(["--dense"] if self._dense.value else [])], [self._files[kind] for kind in used]
 
     def _show(self) -> None:
         """Show the details of what is chosen."""
-        self._marker.visible, self._height.visible = (
-            self._meters.value == MARKER,
-            self._meters.value == HEIGHT,
-        )
-        for kind, html in self._uploads.items():
-            html.visible = FILE_KINDS[kind] in (self._camera.value, self._meters.value)
-            html.content = file_button(
-                f"{'Replace' if kind in self._files else 'Choose'} the {kind} file", kind
-            )
+        chosen = self._camera.value, self._meters.value
+        self._marker.visible, self._height.visible = MARKER in chosen, HEIGHT in chosen
+        for kind, button in self._uploads.items():
+            button.visible = FILE_KINDS[kind] in chosen
+            verb = "Replace" if kind in self._files else "Choose"
+            button.content = file_button(f"{verb} the {kind} file", kind)
 
-    def _add_settings(self, gui: viser.GuiApi, section: Settings, prefix: str = "") -> None:
+    def _add_settings(self, section: Settings, prefix: str = "") -> None:
         """Add a widget for each setting, with its description; not for free text, which could name files or code."""
-        about = descriptions(type(section))
+        gui, about = self._gui, descriptions(type(section))
         for declared in fields(section):
-            value, label, widget = getattr(section, declared.name), declared.name.replace("_", " "), None
+            value, label = getattr(section, declared.name), declared.name.replace("_", " ")
             allowed: Allowed = declared.metadata.get("allowed", Allowed())
-            hint = about.get(declared.name)
+            options: dict[str, Any] = {"hint": about.get(declared.name)}
             if isinstance(value, Settings):
                 if declared.name not in HIDDEN:
                     with gui.add_folder(label, expand_by_default=False):
-                        self._add_settings(gui, value, f"{declared.name}.")
-            elif isinstance(value, bool):
-                widget = gui.add_checkbox(label, value, hint=hint)
+                        self._add_settings(value, f"{declared.name}.")
+                continue
+            if isinstance(value, bool):
+                widget: Any = gui.add_checkbox(label, value, **options)
             elif isinstance(value, int | float):
                 low = allowed.low if allowed.also is None else min(allowed.also, allowed.low)
-                shown = [each if abs(each) < MAX_SHOWN else None for each in (low, allowed.high)]
-                step = 1 if isinstance(value, int) else 1e-6
-                widget = gui.add_number(label, value, min=shown[0], max=shown[1], step=step, hint=hint)
+                limits = [each if abs(each) < MAX_SHOWN else None for each in (low, allowed.high)]
+                options |= {"min": limits[0], "max": limits[1], "step": 1 if isinstance(value, int) else 1e-6}
+                widget = gui.add_number(label, value, **options)
             elif allowed.choices:
-                widget = gui.add_dropdown(label, allowed.choices, initial_value=value, hint=hint)
-            if widget is not None:
-                self._settings[prefix + declared.name] = widget, value
+                widget = gui.add_dropdown(label, allowed.choices, initial_value=value, **options)
+            else:
+                continue
+            self._settings[prefix + declared.name] = widget, value
 
 
 def file_button(label: str, kind: str, color: str = "#e7f0fa;color:#1864ab") -> str:

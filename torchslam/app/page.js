@@ -1,4 +1,4 @@
-/* Added to the page of the viewer: files are dropped or chosen, and uploaded one after the other, with their progress. */
+/* Added to the page of the viewer: files are dropped or chosen, and uploaded with their progress. */
 (() => {
   const bar = document.createElement("div");
   bar.id = "upload-progress";
@@ -15,13 +15,13 @@
     bar.style.display = words ? "block" : "none";
   }
 
-  /** Ask the server; XMLHttpRequest reports the progress of an upload, fetch does not. */
+  /** Ask the server, and say what it does meanwhile; XMLHttpRequest reports the progress of an upload, fetch does not. */
   function ask(method, address, body = null, progress = () => {}) {
     return new Promise((resolve, reject) => {
       const request = new XMLHttpRequest();
       request.open(method, address);
       request.responseType = "json";
-      request.upload.onprogress = (event) => progress(event.loaded);
+      request.upload.onprogress = progress;
       request.onload = () => {
         if (request.status < 300) resolve(request.response);
         else reject(new Error(request.response?.error ?? `the server answers ${request.status}`));
@@ -33,18 +33,12 @@
 
   async function upload(files, kind) {
     const all = [...files].sort((a, b) => a.name.localeCompare(b.name, undefined, { numeric: true }));
-    const total = all.reduce((sum, file) => sum + file.size, 0);
     const what = all.length === 1 ? all[0].name : `${all.length} files`;
+    const progress = ({ loaded, total }) =>
+      say(`${what}: ${loaded < total ? `${Math.floor((100 * loaded) / total)} % uploaded` : "reading it ..."}`);
     try {
-      const { id } = await ask("POST", `/uploads?size=${total}&count=${all.length}`);
-      let before = 0;
-      for (const [position, file] of all.entries()) {
-        const progress = (sent) => say(`${what}: ${Math.floor((100 * (before + sent)) / Math.max(1, total))} % uploaded`);
-        await ask("PUT", `/uploads/${id}/${position}?name=${encodeURIComponent(file.name)}`, file, progress);
-        before += file.size;
-      }
-      say(`${what}: reading it ...`);
-      await ask("POST", `/uploads/${id}/end?kind=${kind}`);
+      const { id } = await ask("POST", "/uploads", JSON.stringify(all.map(({ name, size }) => [name, size])));
+      await ask("PUT", `/uploads/${id}?kind=${kind}`, new Blob(all), progress);
       say("");
     } catch (error) {
       say(`${what}: ${error.message}`, true);
@@ -67,10 +61,8 @@
     if (!take) return;
     say(`writing ${take} ...`); // it is written on demand
     try {
-      const link = document.createElement("a");
-      link.href = (await ask("POST", address)).address;
-      link.download = "";
-      link.click();
+      const { address: href } = await ask("POST", address);
+      Object.assign(document.createElement("a"), { href, download: "" }).click();
       say("");
     } catch (error) {
       say(`${take}: ${error.message}`, true);

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import html
 import threading
-import time
 import traceback
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -19,7 +18,7 @@ from torchslam.app.jobs import DEMO, Runs, State, log_tail, progress_of, tool
 from torchslam.app.options import FILE_KINDS, Options, file_button
 from torchslam.app.scene import Scene, click_of, length_between, length_words
 from torchslam.errors import ResultsError, TorchslamError
-from torchslam.io.file_names import EXAMPLE_IMAGE, METRICS, TRAJECTORY
+from torchslam.io.file_names import METRICS, TRAJECTORY
 from torchslam.utils.console import printable
 
 TICK_S = 1.0
@@ -27,7 +26,7 @@ TICK_S = 1.0
 CHECK_S = 120.0  # seconds in which a reader is to open an upload; tried at this value only
 PLAY_FPS, PLAY_STEPS = 15, 600  # poses a second while the path is played, and in all
 SHOWN_MESSAGES = 6  # last messages of a run
-ERROR = 2  # exit status of an error that the log explains, as of `cli.main`, which is a command
+GOING_ON = (State.RUNNING, State.QUEUED)
 NONE = "—"  # of the lists
 IMAGE, RULER, UP = "show image", "measure", "set up"
 WORDS = {
@@ -50,11 +49,8 @@ class Panel:
         self._scene, self._lock, self._ended = Scene(viewer), threading.RLock(), threading.Event()
         self._shown, self._is_live, self._frame = "", False, -1  # the run that is shown, and its frame
         self._upload: tuple[Path, str] | None = None
-        self._mode, self._rows, self._is_playing = (
-            IMAGE,
-            list[int](),
-            False,
-        )  # of a click; points that were measured
+        self._mode, self._rows = IMAGE, list[int]()  # of a click; points that were measured
+        self._is_playing = False
         viewer.gui.configure_theme(control_width="large", show_logo=False, show_share_button=False)
         viewer.gui.main_panel.dock_right()
         self._status = self._gui.add_html("")
@@ -76,7 +72,7 @@ class Panel:
         self._ended.set()
 
     def received(self, kind: str, path: Path, called: str) -> None:
-        """Take an upload. Raises ResultsError with the reader's message if it cannot be read."""
+        """Take an upload. Raises TorchslamError with the reader's message if it cannot be read."""
         if kind == "recording":
             lines = tool(["info", str(path)], self._runs.folder, called, CHECK_S).splitlines()
             about = dict(line.split(maxsplit=1) for line in lines if len(line.split(maxsplit=1)) == 2)
@@ -90,39 +86,26 @@ class Panel:
         else:
             raise ResultsError("no such kind of upload")
 
-    def taken(self, name: str, kind: str) -> Path:
-        """Write an export of a run, see `exports.write_export`."""
-        return exports.write_export(self._runs.path(name), kind)
-
-    def picture(self, name: str) -> Path:
-        """The picture of a run in the list. Raises ResultsError if there is none yet."""
-        if not (path := self._runs.path(name) / EXAMPLE_IMAGE).is_file():
-            raise ResultsError("the run has no picture yet")
-        return path
-
     # --- tabs
 
     def _add_new(self) -> None:
-        self._source = self._gui.add_html(
-            line_of("Drop a video, a zip of images or several photos on the page, or:")
-        )
+        self._source = self._gui.add_html(line_of("Drop a video, a zip of images or several photos, or:"))
         self._gui.add_html(file_button("Choose a video or photos", "recording", "#228be6;color:#fff"))
         self._recording = self._gui.add_dropdown("In the folder", (NONE, *self._runs.recordings()))
-        self._button(
-            "Demo: a rendered room", lambda _: self._open(self._runs.add("demo room", DEMO, ())), color="gray"
-        )
+        demo = self._button("Demo: a rendered room", lambda _: self._open(self._runs.add("demo room", DEMO)))
+        demo.color = "gray"
         self._options = Options(self._gui)
         self._button("Start", lambda _: self._start())
 
     def _add_result(self) -> None:
         self._summary = self._gui.add_html("")
-        self._timeline = self._gui.add_image(EMPTY, label="inliers of each frame", visible=False)
+        self._timeline = self._gui.add_image(EMPTY, visible=False)
         self._row = self._gui.add_slider("Path", 0, 1, 1, 0, hint="fly along the path")
         self._row.on_update(self._guarded(lambda _: self._scene.fly(int(self._row.value))))
         self._button("Play the path", lambda _: self._toggle_play(), color="gray")
         self._keyframe = self._gui.add_image(EMPTY, visible=False)
         self._other = self._gui.add_dropdown("Compare with", (NONE,))
-        self._button("Compare", lambda _: self._compare(), color="gray")
+        self._button("Compare", lambda _: self._compare(str(self._other.value)), color="gray")
         self._gui.add_html(file_button("Compare with a true path (TUM)", "truth"))
         self._comparison = self._gui.add_html("")
 
@@ -150,13 +133,11 @@ class Panel:
     # --- actions
 
     def _start(self) -> None:
-        words, files = self._options.arguments()
-        chosen = str(self._recording.value)
+        (words, files), chosen = self._options.arguments(), str(self._recording.value)
         if chosen in self._runs.recordings():
             name = self._runs.add(chosen, chosen, words, None, files)
         elif self._upload is not None:
-            path, called = self._upload
-            name, self._upload = self._runs.add(called, "", words, path, files), None
+            name, self._upload = self._runs.add(self._upload[1], "", words, self._upload[0], files), None
         else:
             raise ResultsError("choose a recording first")
         self._source.content = line_of("Drop the next recording on the page, or:")
@@ -166,40 +147,27 @@ class Panel:
         """Show a run: its map so far, or its result; nothing for an empty name."""
         state = self._runs.state(name) if name else None
         self._is_playing, self._shown, self._frame, self._rows = False, name, -1, []
-        self._is_live = state in (State.RUNNING, State.QUEUED)
-        for each in (self._keyframe, self._image, self._timeline):
-            each.visible = False
-        for each in (self._summary, self._comparison, self._commands):
-            each.content = ""
+        self._is_live = state in GOING_ON
+        for image in (self._keyframe, self._image, self._timeline):
+            image.visible = False
+        for text in (self._summary, self._comparison, self._commands):
+            text.content = ""
         self._links.content = line_of("There is no result yet.")
         self._scene.clear()
         if name and not self._is_live and (self._runs.path(name) / METRICS).exists():
             self._show_result(name)
 
     def _show_result(self, name: str) -> None:
-        path, record = self._runs.path(name), self._runs.record(name)
-        data = self._reader.call(reading.result, path)
-        self._scene.show_result(data)
+        data = self._reader.call(reading.result, self._runs.path(name))
+        self._scene.show_result(data["submap"])
         self._summary.content = line_of(data["failure"], "#c92a2a") + table(data["summary"])
         self._timeline.image, self._timeline.visible = data["timeline"], True
         self._links.content = exports.links(f"/runs/{quote(name, safe='')}")
         self._other.options = (NONE, *(each for each in self._runs.names() if each != name))
-        if record.source:
+        if self._runs.record(name).source:
             words = exports.command_and_python(self._runs.command(name), self._runs.folder)
             self._commands.content = f'<pre style="{PRE}">{html.escape(words)}</pre>'
-        if self._scene.submap is not None:
-            self._row.max = max(1, len(self._scene.submap["frame"]) - 1)
-            threading.Thread(target=self._add_thumbnails, args=(path, data), daemon=True).start()
-
-    def _add_thumbnails(self, path: Path, data: dict[str, Any]) -> None:
-        try:
-            images = self._reader.call(reading.thumbnails, path, self._scene.thumbnail_frames())
-        except (TorchslamError, OSError) as error:
-            self._comparison.content = line_of(f"without images: {error}")
-            return
-        with self._lock:
-            if self._scene.data is data:
-                self._scene.show_thumbnails(images)
+        self._row.max = max(1, len(data["submap"].get("poses", ())) - 1)
 
     def _toggle_play(self) -> None:
         def play() -> None:
@@ -207,38 +175,38 @@ class Panel:
             row = 0 if self._row.value >= last else int(self._row.value)
             while self._is_playing and row <= last and not self._ended.wait(1 / PLAY_FPS):
                 self._row.value = row
-                self._scene.fly(row)
                 row += max(1, last // PLAY_STEPS)
             self._is_playing = False
 
-        self._is_playing = not self._is_playing and self._scene.data is not None
+        self._is_playing = not self._is_playing and bool(self._scene.submap)
         if self._is_playing:
             threading.Thread(target=play, daemon=True).start()
 
-    def _compare(self) -> None:
-        other = self._runs.path(str(self._other.value))
-        self._compare_with(other / TRAJECTORY, self._runs.record(other.name).title, is_truth=False)
+    def _compare(self, name: str) -> None:
+        path = self._runs.path(name) / TRAJECTORY
+        self._compare_with(path, self._runs.record(name).title, is_truth=False)
 
     def _compare_with(self, path: Path, title: str, is_truth: bool) -> None:
-        if self._scene.submap is None:
+        if not self._scene.submap:
             raise ResultsError("open a result first")
-        positions, words = self._reader.call(reading.compared, self._runs.path(self._shown), path, is_truth)
+        shown, S = self._runs.path(self._shown), self._scene.submap["S_shown_map"]
+        positions, words = self._reader.call(reading.compared, shown, path, is_truth, S)
         self._scene.show_other(positions)
         self._comparison.content = line_of(f"{title} (orange): {words}")
 
     def _set_mode(self, mode: str) -> None:
         self._mode, self._rows = mode, []
-        self._length.content = line_of(WORDS.get(mode, ""))
+        self._length.content = line_of(WORDS[mode])
 
     def _clicked(self, event: Any) -> None:
-        if self._scene.submap is None:
+        if not self._scene.submap:
             return
-        row = self._scene.clicked(event, is_keyframe=self._mode == IMAGE)
+        row, words = self._scene.clicked(event, is_keyframe=self._mode == IMAGE), WORDS[self._mode]
         if row < 0:
-            self._length.content = line_of("There is nothing within 14 pixels.")
+            words = "There is nothing within 14 pixels."
         elif self._mode == IMAGE:
-            image, words = self._reader.call(reading.residuals, self._runs.path(self._shown), row)
-            self._keyframe.image, self._keyframe.label, self._keyframe.visible = image, words, True
+            found = self._reader.call(reading.residuals, self._runs.path(self._shown), row)
+            (self._keyframe.image, self._keyframe.label), self._keyframe.visible = found, True
         elif self._mode == UP:
             self._scene.turn_up(row, np.asarray(event.ray_origin))
         else:
@@ -248,34 +216,26 @@ class Panel:
             if len(self._rows) == 2:
                 length = length_between(self._scene.submap, self._rows)
                 words = f"Length: {length_words(*length, self._scene.submap['unit'])}"
-            self._length.content = line_of(words)
+        self._length.content = line_of(words)
 
     def _set_length(self) -> None:
         """Bring the map into meters, as `torchslam align` does, by the length that was measured."""
-        data, submap = self._scene.data, self._scene.submap
-        if data is None or submap is None or len(self._rows) != 2:
+        if len(self._rows) != 2:
             raise ResultsError("measure a length first")
-        clicks = [click_of(submap, data["size"], row) for row in self._rows]
-        if None in clicks:
+        clicks = [click for row in self._rows if (click := click_of(self._scene.submap, row))]
+        if len(clicks) != 2:
             raise ResultsError("no frame of the run shows both points: click other ones")
-        words = [
-            "align",
-            str(self._runs.path(self._shown)),
-            "--distance",
-            *map(str, clicks),
-            f"{self._meters.value:g}",
-        ]
-        tool(words, self._runs.folder)
+        path, meters = str(self._runs.path(self._shown)), f"{self._meters.value:g}"
+        tool(["align", path, "--distance", *clicks, meters], self._runs.folder)
         self._open(self._shown)
 
     def _crop_scene(self) -> None:
-        if self._scene.submap is None:
-            return
-        low, high = np.asarray(self._scene.submap["box"])
-        share = np.array([slider.value for slider in self._crop], float).T / 100
-        limits = low + (2.0 * share - 0.5) * (high - low)  # the box leaves out what is far
-        limits[share == 0.0], limits[share == 1.0] = -np.inf, np.inf
-        self._scene.crop(limits, bool(self._is_dense.value))
+        if self._scene.submap:
+            low, high = np.asarray(self._scene.submap["box"])
+            share = np.array([slider.value for slider in self._crop], float).T / 100
+            limits = low + (2.0 * share - 0.5) * (high - low)  # the box leaves out what is far
+            limits[share == 0.0], limits[share == 1.0] = -np.inf, np.inf
+            self._scene.crop(limits, bool(self._is_dense.value))
 
     def _ask_delete(self, client: viser.ClientHandle) -> None:
         name = self._runs.path(str(self._chosen.value)).name
@@ -295,14 +255,14 @@ class Panel:
     # --- what goes on
 
     def _watch(self) -> None:
-        refresh, follow = self._guarded(lambda _: None), self._guarded(lambda _: self._follow())
+        look = self._guarded(lambda _: self._follow() if self._is_live else None)
         while not self._ended.wait(TICK_S):
-            (follow if self._is_live else refresh)(None)
+            look(None)
 
     def _follow(self) -> None:
         """Show the map so far of the run that is shown; its result once it has ended."""
         self._runs.advance()  # also if the images cannot be read
-        if self._runs.state(self._shown) not in (State.RUNNING, State.QUEUED):
+        if self._runs.state(self._shown) not in GOING_ON:
             self._open(self._shown)
             return
         path, words = self._runs.path(self._shown), tuple(self._runs.command(self._shown)[1:])
@@ -321,11 +281,14 @@ class Panel:
         self._runs.advance()
         names, rows = self._runs.names(), list[str]()
         for name in names:
-            record, state = self._runs.record(name), self._runs.state(name)
-            until = time.time() if state is State.RUNNING else record.ended
-            took = f", {until - record.started:.0f} s" if 0 < record.started <= until else ""
+            title, state, took = (
+                self._runs.record(name).title,
+                self._runs.state(name),
+                self._runs.seconds(name),
+            )
             image = f'<img src="/runs/{quote(name, safe="")}/picture" alt="" style="{PICTURE}">'
-            words = f"<b>{html.escape(record.title)}</b><br>{html.escape(name)}<br>{state.value}{took}"
+            words = f"<b>{html.escape(title)}</b><br>{html.escape(name)}<br>{state.value}"
+            words += f", {took:.0f} s" if took else ""
             rows.append(f'<div style="{ROW}">{image if state is State.DONE else ""}<div>{words}</div></div>')
         change(self._list, "content", "".join(rows) or line_of("No runs yet."))
         change(self._chosen, "options", (NONE, *names))
@@ -335,27 +298,23 @@ class Panel:
 
     def _refresh_status(self) -> None:
         """Update what is above the tabs: state, progress and messages of the run that is shown."""
-        state: State | None = None
-        log = list[str]()
-        content = "torchslam: from a video to a map"
-        if self._shown:
-            state, log = self._runs.state(self._shown), log_tail(self._runs.path(self._shown))
-            content = f"<b>{html.escape(self._runs.record(self._shown).title)}</b>: {state.value}"
+        state = self._runs.state(self._shown) if self._shown else None
+        log = log_tail(self._runs.path(self._shown)) if self._shown else []
         words, share = progress_of(log) if state is State.RUNNING else ("", 0.0)
         messages = [line.removeprefix("torchslam: ") for line in log if line.startswith("torchslam: ")]
-        if state is State.FAILED and (status := self._runs.record(self._shown).status) != ERROR:
-            messages.append(
-                f"the run ended unexpectedly, with status {status}: {log[-1] if log else 'no message'}"
-            )
+        if state is State.FAILED and not (log and log[-1].startswith("torchslam: error: ")):
+            messages.append(f"the run ended unexpectedly: {log[-1] if log else 'no message'}")
         lines = [words, *(messages[-SHOWN_MESSAGES:] if state is not State.DONE else [])]
+        content = "torchslam: from a video to a map"
+        if state is not None:
+            content = f"<b>{html.escape(self._runs.record(self._shown).title)}</b>: {state.value}"
         content += "".join(f"<br>{html.escape(each)}" for each in lines if each)
         change(self._status, "content", f'<div style="{LINE}">{content}</div>')
         change(self._bar, "value", 100.0 * share)
-        is_going_on = state in (State.RUNNING, State.QUEUED)
-        change(self._bar, "visible", is_going_on)
-        change(self._stop, "visible", is_going_on)
+        for each in (self._bar, self._stop):
+            change(each, "visible", state in GOING_ON)
         change(self._resume, "visible", state in (State.STOPPED, State.FAILED))
-        if is_going_on and not self._is_live:  # it was resumed
+        if state in GOING_ON and not self._is_live:  # it was resumed
             self._open(self._shown)
 
     def _button(self, label: str, action: Callable[[Any], None], **options: Any) -> viser.GuiButtonHandle:

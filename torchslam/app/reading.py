@@ -8,33 +8,32 @@ from __future__ import annotations
 import argparse
 import multiprocessing
 import os
-import re
 import threading
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures import TimeoutError as TooLate
 from concurrent.futures.process import BrokenProcessPool
 from functools import lru_cache
+from importlib import import_module
 from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
 
-from torchslam.errors import FrameError, ResultsError
+from torchslam.errors import ResultsError, TorchslamError
 
 Answer = TypeVar("Answer")
 NICENESS = 5
 """Of the process, relative to the server: a run that is watched comes first. With 10 it starved on a busy machine."""
 PATIENCE_S = 300.0
 """Seconds after which reading is given up. Tried at this value only."""
-LIVE_SIDE, THUMBNAIL_SIDE = 480, 96
-"""Longer sides of the image during a run, and of those in the frusta, pixels."""
+LIVE_SIDE, THUMBNAIL_SIDE, MAX_THUMBNAILS = 480, 96, 48
+"""Longer sides of the image during a run and of those in the frusta, pixels; and number of the latter. A frustum with
+its image takes .15 ms of a frame where there is no GPU."""
 MAX_KEPT = 600  # images that are kept to color the points of a run: up to 0.7 MB each
 MAX_PASSED = 4  # keyframes since the last look whose images are read as well
 UNSEEN = (150, 155, 165)  # red, green, blue of points without an image
-STATE_COLORS = ((201, 180, 88), (87, 190, 65), (190, 130, 225), (200, 85, 61))
-"""Red, green, blue of the states in the timeline, in the order of `types.State`: about those of view.html."""
-TIMELINE_SIZE, BREAK_COLOR = (600, 60), (220, 30, 30)  # width and height, pixels; red, green, blue
+TIMELINE_INCHES = 5.0, 2.6  # width and height, of 100 pixels: about the width of the panel
 
 
 class ReadingProcess:
@@ -64,7 +63,7 @@ class ReadingProcess:
 
     def _start(self) -> ProcessPoolExecutor:
         pool = ProcessPoolExecutor(1, multiprocessing.get_context("spawn"), _begin)
-        pool.submit(_import)  # now rather than with the first image
+        pool.submit(import_module, "torchslam.cli.run")  # now rather than with the first image
         return pool
 
 
@@ -83,11 +82,6 @@ def _begin() -> None:
     os.nice(NICENESS)
     torch.set_num_threads(1)
     cv2.setNumThreads(1)
-
-
-def _import() -> None:
-    import torchslam.cli.run
-    import torchslam.io.viewer.page  # noqa: F401
 
 
 class _Watched:
@@ -120,9 +114,7 @@ class _Watched:
         return colors
 
 
-@lru_cache(maxsize=1)
-def _watched(words: tuple[str, ...]) -> _Watched:
-    return _Watched(words)
+_watched = lru_cache(maxsize=1)(_Watched)
 
 
 def live(folder: Path, words: tuple[str, ...], shown: int) -> dict[str, Any] | None:
@@ -130,76 +122,70 @@ def live(folder: Path, words: tuple[str, ...], shown: int) -> dict[str, Any] | N
 
     None if its frame is that which is shown already, or there is no file.
     """
-    import cv2
-
-    from torchslam.io.viewer.frames import COLORS
+    from torchslam.io.viewer.frames import COLORS, draw_keypoints
     from torchslam.io.viewer.live_map import read_live_map
     from torchslam.types import State
 
     found = read_live_map(folder)
-    if found is None or int(found["frame"]) == shown:
+    if found is None or (frame := int(found["frame"])) == shown:
         return None
-    watched, width = _watched(words), found["camera"][4]
-    passed = [
-        each for each in sorted(set(found["seen_frame"].tolist())) if shown < each < int(found["frame"])
-    ]
-    for frame in passed[:MAX_PASSED]:  # a decoder comes by them on its way
-        watched.image(frame)
-    drawn = watched.image(int(found["frame"])).copy()
+    watched, width = _watched(words), found["size"][0]
+    passed = [each for each in np.unique(found["seen_frame"]).tolist() if shown < each < frame]
+    for each in passed[:MAX_PASSED]:  # a decoder comes by them on its way
+        watched.image(each)
+    drawn = watched.image(frame).copy()
     found["colors"] = watched.colors(found["seen_frame"], found["seen_pixel"], width)
-    own = COLORS[State(str(found["state"]))][::-1]
-    for pixels, color, radius in ((found["keypoints"], UNSEEN, 1), (found["tracked"], own, 2)):
-        for x, y in np.round(pixels * (drawn.shape[1] / width)).astype(int).tolist():
-            cv2.circle(drawn, (x, y), radius, color, 1, cv2.LINE_AA)
+    for pixels, color, radius in (
+        (found["keypoints"], UNSEEN, 1),
+        (found["tracked"], COLORS[State(str(found["state"]))][::-1], 2),
+    ):
+        draw_keypoints(drawn, pixels * (drawn.shape[1] / width), color, radius)
     return found | {"image": drawn}
 
 
 def result(folder: Path) -> dict[str, Any]:
-    """The data of view.html with arrays instead of text, the summary of the run, its camera and the timeline."""
+    """What the page shows of a run.
+
+    Returns:
+        summary, failure: of the run; words by name, and words
+        timeline: (H, W, 3) picture of all frames
+        submap: of the main submap, the data of view.html, with what is drawn beside: `uncertain` (F,) poses, `frames`
+            (K,) of the keyframes, `size` of the images, `corners` (4, 3) of the frusta in their cameras, small `images`
+            of keyframes by row; empty without a map
+    """
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+
+    from torchslam.io.plots import plot_tracking
+    from torchslam.io.plots.charts import thin
     from torchslam.io.report import summary
     from torchslam.io.results import read_results
-    from torchslam.io.viewer.page import decoded, page_data
-
-    def arrays(value: Any) -> Any:
-        if isinstance(value, dict):
-            is_array = value.keys() == {"type", "data"}
-            return decoded(value) if is_array else {key: arrays(each) for key, each in value.items()}
-        return [arrays(each) for each in value] if isinstance(value, list) else value
+    from torchslam.io.viewer.page import page_data
+    from torchslam.types import State
 
     results = read_results(folder)
-    data, breaks = arrays(page_data(results)), (results.metrics.get("check") or {}).get("breaks", [])
-    rows = summary(results.metrics) | ({"breaks": "; ".join(breaks)} if breaks else {})
-    at = [int(found[1]) for each in breaks if (found := re.search(r"between frames (\d+)", each))]
-    picture = timeline(data["frames"]["state"], data["frames"]["inliers"], data["frames"]["index"], at)
-    return data | {"camera": results.camera.params[:4].tolist(), "summary": rows, "timeline": picture}
-
-
-def timeline(states: np.ndarray, inliers: np.ndarray, indices: np.ndarray, breaks: list[int]) -> np.ndarray:
-    """A picture of all frames from left to right: inliers as height, the state as color, breaks of the check in red."""
-    (width, height), count = TIMELINE_SIZE, max(1, len(states))
-    image = np.full((height, width, 3), 245, np.uint8)
-    for x, row in enumerate(np.arange(width) * len(states) // width if len(states) else ()):
-        share = 0.15 + 0.85 * max(0, inliers[row]) / max(1, inliers.max())
-        image[height - round(share * height) :, x] = STATE_COLORS[states[row]]
-    for place in breaks:
-        x = int(np.searchsorted(indices, place)) * width // count
-        image[:, min(x, width - 2) : x + 2] = BREAK_COLOR
-    return image
-
-
-def thumbnails(folder: Path, frames: list[int]) -> dict[int, np.ndarray]:
-    """Small images of keyframes: red, green, blue; those that cannot be read are missing."""
-    from torchslam.io.results import open_run
-
-    run, found = open_run(folder), dict[int, np.ndarray]()
-    if run.main is not None:
-        images = run.images(run.scene(run.main, keyframes_alone=True))
-        for frame in frames:
-            try:
-                found[frame] = small(images.bgr(frame)[..., ::-1], THUMBNAIL_SIDE)
-            except FrameError:
-                continue
-    return found
+    data, rows = page_data(results), summary(results.metrics)
+    frames, submap = data["frames"], dict[str, Any]()
+    if results.main is not None and len(results.trajectory):
+        submap = data["submaps"][0]
+        submap["uncertain"] = frames["state"][submap["frame"]] == list(State).index(State.UNCERTAIN)
+        submap["frames"], submap["size"] = frames["index"][submap["keyframe"]], data["size"]
+        submap["corners"] = submap["frustum"] * np.array(data["corners"])
+        images = submap["images"] = dict[int, np.ndarray]()
+        try:
+            opened = results.images(results.scene(results.main, keyframes_alone=True))
+            for row in thin(len(submap["frames"]), MAX_THUMBNAILS).tolist():
+                images[row] = small(opened.bgr(int(submap["frames"][row]))[..., ::-1], THUMBNAIL_SIDE)
+        except (TorchslamError, OSError) as error:  # moved, or damaged
+            rows["images"] = f"not shown: {error}"
+        if not len(submap["colors"]):
+            submap["colors"] = np.full(submap["points"].shape, UNSEEN, np.uint8)
+    figure = plot_tracking(results.frames, breaks=results.breaks)
+    figure.set_size_inches(TIMELINE_INCHES)
+    canvas = FigureCanvasAgg(figure)
+    canvas.draw()
+    rows |= {"breaks": "; ".join(results.breaks)} if results.breaks else {}
+    picture = np.array(canvas.buffer_rgba())[..., :3]
+    return {"summary": rows, "failure": data["failure"], "timeline": picture, "submap": submap}
 
 
 def residuals(folder: Path, frame: int) -> tuple[np.ndarray, str]:
@@ -208,6 +194,7 @@ def residuals(folder: Path, frame: int) -> tuple[np.ndarray, str]:
 
     from torchslam.geometry import transform
     from torchslam.io.results import open_run
+    from torchslam.io.viewer.frames import draw_keypoints
 
     run = open_run(folder)
     if run.main is None:
@@ -221,20 +208,18 @@ def residuals(folder: Path, frame: int) -> tuple[np.ndarray, str]:
     image = run.images(scene).bgr(frame)[..., ::-1]
     drawn = small(image, 2 * LIVE_SIDE)
     scale = drawn.shape[1] / image.shape[1]
-    starts, ends = (
-        np.round(scale * each).astype(int).tolist() for each in (observed, observed + 10 * residual)
-    )
-    for start, end in zip(starts, ends, strict=True):
+    ends = np.round(scale * np.stack((observed, observed + 10 * residual), axis=1)).astype(int).tolist()
+    for start, end in ends:
         cv2.line(drawn, start, end, (230, 70, 60), 1, cv2.LINE_AA)
-        cv2.circle(drawn, start, 2, (87, 190, 65), 1, cv2.LINE_AA)
+    draw_keypoints(drawn, scale * observed, (87, 190, 65), 2)
     middle = np.median(np.linalg.norm(residual, axis=1)) if len(observed) else np.nan
-    return (
-        drawn,
-        f"frame {frame}: {len(observed)} points, median residual {middle:.2f} px (drawn ten times as long)",
-    )
+    words = f"{len(observed)} points, median residual {middle:.2f} px (drawn ten times as long)"
+    return drawn, f"frame {frame}: {words}"
 
 
-def compared(folder: Path, other: Path, is_truth: bool) -> tuple[np.ndarray, str]:
+def compared(
+    folder: Path, other: Path, is_truth: bool, S_shown_map: list[list[float]]
+) -> tuple[np.ndarray, str]:
     """Another path, aligned by a similarity with that of a results folder in the axes in which it is shown.
 
     Returns:
@@ -245,13 +230,11 @@ def compared(folder: Path, other: Path, is_truth: bool) -> tuple[np.ndarray, str
     from torchslam.data.trajectories import read_trajectory
     from torchslam.evaluation import evaluate
     from torchslam.geometry import transform
-    from torchslam.io.results import TRAJECTORY, read_results
-    from torchslam.io.viewer.page import page_data
+    from torchslam.io.results import TRAJECTORY
 
     own, theirs = read_trajectory(folder / TRAJECTORY), read_trajectory(other)
     found = evaluate(own, theirs) if is_truth else evaluate(theirs, own)
     S = torch.linalg.inv(found.S_groundtruth_estimate) if is_truth else found.S_groundtruth_estimate
-    S_shown_map = page_data(read_results(folder))["submaps"][0]["S_shown_map"]
     shown = torch.tensor(S_shown_map, dtype=torch.float64, device="cpu")
     what, unit = ("ATE", "m") if is_truth else ("difference", "units of this result")
     words = f"{what} {found.ate_m:.4g} {unit} RMSE after Sim(3) alignment, over {len(found.errors_m)} frames"

@@ -7,31 +7,26 @@ from typing import Any
 
 import numpy as np
 import viser
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from viser.transforms import SO3
 
 # Red, green, blue.
 PATH, UNCERTAIN, TRUTH, OTHER = (87, 150, 65), (190, 130, 225), (60, 60, 60), (230, 140, 40)
-FRUSTUM, MARK = (70, 110, 190), (230, 60, 50)  # red, green, blue
-UNCERTAIN_STATE = 2  # number of `types.State.UNCERTAIN`, whose module needs torch
-MAX_FRUSTA, MAX_THUMBNAILS = 400, 48
-"""Keyframes that are drawn as frusta, and those of them with an image. Tried at these values only."""
+FRUSTUM, MARK = (70, 110, 190), (230, 60, 50)
+BEADS = 4000
+"""Points that a path is drawn by. They touch up to a path of ten times the scene. Without a GPU a point takes 1 µs of a
+frame, a line segment of the viewer 100 µs."""
 REACH_PX, BESIDE_PX = 14.0, 3.0
 """Pixels from a click to what it means, and by which what is nearer to the eye may be farther away, as in view.html."""
 PLANE_POINTS = 40
 """Neighbors of a click that determine a plane. Tried at this value only."""
 PIXEL_STEPS = 65535  # of an image point, over the image; as `page.STEPS`, whose module needs torch
 MIN_SIZE = 1e-6  # of what is drawn, in map units: so that nothing divides by zero
+SIDES = ((0, 1, 2), (0, 2, 3), (0, 3, 4), (0, 4, 1))  # triangles of a frustum: its center, and corners
 
 
 class Scene:
-    """The scene of the page, the same for all who look at it.
-
-    Attributes:
-        data: the result that is shown, as of `reading.result`; None during a run.
-        submap: its main submap; None without one.
-        points: (P, 3) of the sparse map that is shown.
-    """
+    """The scene of the page, the same for all who look at it; `submap`: the result, as of `reading.result`."""
 
     def __init__(self, server: viser.ViserServer) -> None:
         self._server, self._scene = server, server.scene
@@ -40,76 +35,48 @@ class Scene:
     def clear(self) -> None:
         """Draw nothing."""
         self._scene.reset()
-        self.data: dict[str, Any] | None = None
-        self.submap: dict[str, Any] | None = None
-        self.points, self._colors = np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8)
-        self._dense: tuple[np.ndarray, np.ndarray] | None = None
-        self.frames, self._keyframes = np.zeros(0, int), np.zeros((0, 3, 4), np.float32)
-        self._is_aimed, self._size = False, 1.0
+        self.submap = dict[str, Any]()
+        self._is_aimed, self._size, self._random = False, 1.0, np.random.default_rng(0)
 
     def show_live(self, found: dict[str, Any]) -> None:
         """Draw a map that grows, as of `reading.live`. Its world is that of the first camera: y points down."""
-        poses, points, (_, fy, _, _, width, height) = found["poses"], found["points"], found["camera"]
+        poses, points = found["poses"], found["points"]
         if not len(points):
             return
         low, high = np.percentile(points, (5, 95), axis=0)
         self._size = max(float(np.linalg.norm(high - low)), MIN_SIZE)
         with self._server.atomic():
             self._cloud("points", points, found["colors"], 0.004)
-            self._path(poses, found["uncertain"], found["breaks"])
-            if len(poses):
-                self._frustum("camera", poses[-1], (fy, width, height), 0.08, found["image"])
+            self._path("path", poses[:, :, 3], found["uncertain"], found["breaks"])
+            corners = 0.08 * self._size * found["corners"]
+            self._frusta(poses[-1:], corners)
+            self._images({0: found["image"]}, poses[-1:], corners)
         if not self._is_aimed:
             self._is_aimed = True
             self._scene.set_up_direction("-y")
-            self.aim((low + high) / 2, (0.5, -0.7, -1.0), 1.3 * self._size)
+            self._aim((low + high) / 2, (0.5, -0.7, -1.0), 1.3 * self._size)
 
-    def show_result(self, data: dict[str, Any]) -> None:
-        """Draw the main submap of a result."""
+    def show_result(self, submap: dict[str, Any]) -> None:
+        """Draw a submap; nothing for an empty one."""
         self.clear()
-        self.data = data
+        self.submap = submap
         self._scene.set_up_direction("+z")
-        if not data["submaps"]:
-            return
-        self.submap = submap = data["submaps"][0]
-        self._size = max(2.0 * submap["radius"], MIN_SIZE)
-        self.points, colors = submap["points"].reshape(-1, 3), submap["colors"].reshape(-1, 3)
-        self._colors = colors if len(colors) else np.full(self.points.shape, 130, np.uint8)
-        if (dense := submap["dense"]) is not None:
-            steps = dense["points"].reshape(-1, 3) * np.asarray(dense["step"], np.float32)
-            self._dense = np.asarray(dense["low"], np.float32) + steps, dense["colors"].reshape(-1, 3)
-        self._keyframes = submap["keyframe_poses"].reshape(-1, 3, 4)
-        rows = spread(len(self._keyframes), MAX_FRUSTA)
-        self._keyframes, self.frames = (
-            self._keyframes[rows],
-            data["frames"]["index"][submap["keyframe"]][rows],
-        )
-        with self._server.atomic():
-            self.crop(None)
-            states = data["frames"]["state"][submap["frame"]]
-            self._path(submap["poses"].reshape(-1, 3, 4), states == UNCERTAIN_STATE, submap["breaks"])
-            self._segments("truth", strip(submap["truth"].reshape(-1, 3)), TRUTH)
-            corners = np.asarray(data["corners"]) * submap["frustum"]
-            self._segments("frusta", outlines(self._keyframes, corners), FRUSTUM, 1.0)
-        self.aim(np.zeros(3), (0.6, -1.0, 0.7), 1.5 * submap["radius"])
-
-    def thumbnail_frames(self) -> list[int]:
-        """The keyframes whose images are to be shown."""
-        return [int(each) for each in self.frames[spread(len(self.frames), MAX_THUMBNAILS)]]
-
-    def show_thumbnails(self, images: dict[int, np.ndarray]) -> None:
-        """Add the images of keyframes to their frusta, as of `reading.thumbnails`."""
-        if self.data is None or self.submap is None:
-            return
-        camera, size = (self.data["camera"][1], *self.data["size"]), self.submap["frustum"] / self._size
-        for frame, image in images.items():
-            pose = self._keyframes[self.frames.tolist().index(frame)]
-            self._frustum(f"images/{frame}", pose, camera, size, image)
+        if submap:
+            self._size = max(2.0 * submap["radius"], MIN_SIZE)
+            with self._server.atomic():
+                self.crop(None)
+                self._path("path", submap["poses"][:, :, 3], submap["uncertain"], submap["breaks"])
+                self._path("truth", submap["truth"], color=TRUTH)
+                self._frusta(submap["keyframe_poses"], submap["corners"])
+                self._images(submap["images"], submap["keyframe_poses"], submap["corners"])
+            self._aim(np.zeros(3), (0.6, -1.0, 0.7), 1.5 * submap["radius"])
 
     def crop(self, limits: Float[np.ndarray, "2 3"] | None, is_dense: bool = True) -> None:
         """Draw the points within two corners, the dense ones if there are any and they are wanted."""
-        is_dense = is_dense and self._dense is not None
-        points, colors = self._dense if is_dense and self._dense is not None else (self.points, self._colors)
+        dense, points, colors = (self.submap[name] for name in ("dense", "points", "colors"))
+        if is_dense := is_dense and dense is not None:
+            low, step = (np.asarray(dense[name], np.float32) for name in ("low", "step"))
+            points, colors = low + dense["points"] * step, dense["colors"]
         if limits is not None:
             inside = ((points >= limits[0]) & (points <= limits[1])).all(axis=1)
             points, colors = points[inside], colors[inside]
@@ -117,106 +84,101 @@ class Scene:
 
     def show_other(self, positions: Float[np.ndarray, "N 3"]) -> None:
         """Draw another path, which is aligned with this one."""
-        self._segments("other", strip(positions), OTHER)
+        self._path("other", positions, color=OTHER)
 
     def show_marks(self, rows: list[int]) -> None:
         """Mark points, and the line between two."""
-        red = np.broadcast_to(np.array(MARK, np.uint8), (len(rows), 3))
-        self._cloud("marks", self.points[rows], red, 0.015)
-        self._segments("between", strip(self.points[rows]), MARK)
+        marked = self.submap["points"][rows]
+        self._cloud("marks", marked, np.full((len(rows), 3), MARK, np.uint8), 0.015)
+        self._path("between", marked, color=MARK)
 
     def turn_up(self, row: int, eye: Float[np.ndarray, "3"]) -> None:
         """Make the normal of the plane around a point the direction that is up."""
-        self._scene.set_up_direction(tuple(map(float, plane_normal(self.points, row, eye))))
+        up = plane_normal(self.submap["points"], row, eye)
+        self._scene.set_up_direction((float(up[0]), float(up[1]), float(up[2])))
 
     def fly(self, row: int) -> None:
         """Put the eyes of all who look into a pose of the path."""
-        if self.submap is None or not len(self.submap["poses"]):
-            return
-        poses = self.submap["poses"].reshape(-1, 3, 4).astype(float)
-        pose = poses[min(row, len(poses) - 1)]
-        for client in self._server.get_clients().values():
-            with client.atomic():
-                client.camera.wxyz, client.camera.position = SO3.from_matrix(pose[:, :3]).wxyz, pose[:, 3]
-
-    def aim(self, center: np.ndarray, direction: tuple[float, float, float], distance: float) -> None:
-        """Put the eyes of all who look, and of those who come, at a distance of a center."""
-        position = center + distance * np.asarray(direction) / np.linalg.norm(direction)
-        for camera in (
-            self._server.initial_camera,
-            *(each.camera for each in self._server.get_clients().values()),
-        ):
-            camera.near, camera.far = distance / 1000, distance * 100
-            camera.position, camera.look_at = position, np.asarray(center)
+        for pose in self.submap["poses"][: row + 1][-1:].astype(float) if self.submap else ():
+            for client in self._server.get_clients().values():
+                with client.atomic():
+                    client.camera.wxyz = SO3.from_matrix(pose[:, :3]).wxyz
+                    client.camera.position = pose[:, 3]
 
     def clicked(self, event: Any, is_keyframe: bool) -> int:
         """The frame of the keyframe, or the row of the point, that is seen where a click was; -1 without one."""
         pixel = event.client.camera.fov / max(1, event.client.camera.image_height)
-        points = self._keyframes[:, :, 3] if is_keyframe else self.points
+        points = self.submap["keyframe_poses"][:, :, 3] if is_keyframe else self.submap["points"]
         row = nearest_to_ray(points, np.asarray(event.ray_origin), np.asarray(event.ray_direction), pixel)
-        return int(self.frames[row]) if is_keyframe and row >= 0 else row
+        return int(self.submap["frames"][row]) if is_keyframe and row >= 0 else row
+
+    def _aim(self, center: np.ndarray, direction: tuple[float, float, float], distance: float) -> None:
+        """Put the eyes of all who look, and of those who come, at a distance of a center."""
+        position = center + distance * np.asarray(direction) / np.linalg.norm(direction)
+        clients = self._server.get_clients().values()
+        for camera in (self._server.initial_camera, *(each.camera for each in clients)):
+            camera.near, camera.far = distance / 1000, distance * 100
+            camera.position, camera.look_at = position, np.asarray(center)
 
     def _cloud(self, name: str, points: np.ndarray, colors: np.ndarray, size: float) -> None:
-        options: dict[str, Any] = {"precision": "float32", "point_shape": "circle", "point_shading": "flat"}
-        self._scene.add_point_cloud(name, points, colors, point_size=size * self._size, **options)
-
-    def _path(self, poses: np.ndarray, uncertain: np.ndarray, breaks: Any) -> None:
-        """Draw a path; steps to uncertain poses in another color, and none across a break."""
-        segments = strip(poses[:, :, 3])
-        is_kept = np.ones(len(segments), bool)
-        is_kept[[int(row) - 1 for row in breaks]] = False
-        colors = np.where(
-            np.asarray(uncertain, bool)[1:, None, None],
-            np.array(UNCERTAIN, np.uint8),
-            np.array(PATH, np.uint8),
-        )
-        self._segments("path", segments[is_kept], np.repeat(colors, 2, axis=1)[is_kept], 3.0)
-
-    def _segments(self, name: str, segments: np.ndarray, color: Any, pixels: float = 2.0) -> None:
-        if len(segments):
-            self._scene.add_line_segments(name, segments, color, thickness=pixels, thickness_units="screen")
+        """Draw points in random order, as page.js wants them; their size is relative to that of the scene."""
+        if len(points):
+            order = self._random.permutation(len(points))
+            style: dict[str, Any] = {"precision": "float32", "point_shape": "square", "point_shading": "flat"}
+            style["point_size"] = size * self._size
+            self._scene.add_point_cloud(name, points[order], colors[order], **style)
         elif self._scene.get_handle_by_name(name):
             self._scene.remove_by_name(name)
 
-    def _frustum(
-        self, name: str, pose: np.ndarray, camera: tuple[float, ...], size: float, image: np.ndarray
+    def _path(
+        self,
+        name: str,
+        positions: np.ndarray,
+        uncertain: Any = (),
+        breaks: Any = (),
+        color: tuple[int, int, int] = PATH,
     ) -> None:
-        """Draw a frustum with its image; camera: fy, width, height."""
-        fy, width, height = camera
-        placed: dict[str, Any] = {
-            "wxyz": SO3.from_matrix(pose[:, :3].astype(float)).wxyz,
-            "position": pose[:, 3],
-        }
-        style: dict[str, Any] = {
-            "color": FRUSTUM,
-            "thickness": 1.0,
-            "thickness_units": "screen",
-            "cast_shadow": False,
-        }
-        # The viewer scales a frustum to the volume of a cube; this makes its depth the wanted one.
-        scale = size * self._size * (width * height / (12 * fy**2)) ** (1 / 3)
-        fov = 2 * math.atan(height / (2 * fy))
-        self._scene.add_camera_frustum(name, fov, width / height, scale=scale, image=image, **placed, **style)
+        """Draw a path; steps to uncertain poses in another color, and none across a break."""
+        is_kept = np.ones(max(0, len(positions) - 1), bool)
+        is_kept[[int(row) - 1 for row in breaks]] = False
+        points, ends = beads(positions.astype(float), is_kept)
+        is_uncertain = np.isin(ends, np.flatnonzero(uncertain))[:, None]
+        colors = np.where(is_uncertain, np.array(UNCERTAIN, np.uint8), np.array(color, np.uint8))
+        self._cloud(name, points.astype(np.float32), colors, 0.0025)
+
+    def _frusta(self, poses: np.ndarray, corners: Float[np.ndarray, "4 3"]) -> None:
+        """Draw the edges of frusta, all at once, and in random order like points."""
+        order = self._random.permutation(len(poses))
+        faces = (np.array(SIDES) + 5 * order[:, None, None]).reshape(-1, 3)
+        tips = np.concatenate((np.zeros((1, 3)), corners))
+        vertices = poses[:, None, :, 3] + np.einsum("kij,cj->kci", poses[:, :, :3], tips)
+        style: dict[str, Any] = {"color": FRUSTUM, "cast_shadow": False, "receive_shadow": False}
+        if len(poses):
+            self._scene.add_mesh_simple("frusta", vertices.reshape(-1, 3), faces, wireframe=True, **style)
+
+    def _images(
+        self, images: dict[int, np.ndarray], poses: np.ndarray, corners: Float[np.ndarray, "4 3"]
+    ) -> None:
+        """Draw images at the ends of the frusta of some poses, by row."""
+        center, (width, height, _) = corners.mean(axis=0), corners[2] - corners[0]
+        plain: dict[str, Any] = {"cast_shadow": False, "receive_shadow": False}
+        for row, image in images.items():
+            R, t = poses[row, :, :3].astype(float), poses[row, :, 3]
+            placed = {"wxyz": SO3.from_matrix(R).wxyz, "position": t + R @ center}
+            self._scene.add_image(f"images/{row}", image, width, height, **placed, **plain)
 
 
-def spread(count: int, limit: int) -> Int[np.ndarray, " R"]:
-    """Indices of at most `limit` of `count` rows, evenly spread."""
-    return np.arange(count) if count <= limit else np.linspace(0, count - 1, limit).round().astype(int)
-
-
-def strip(positions: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "M 2 3"]:
-    """The segments between successive positions."""
-    return np.stack((positions[:-1], positions[1:]), axis=1)
-
-
-def outlines(
-    poses: Float[np.ndarray, "K 3 4"], corners: Float[np.ndarray, "4 3"]
-) -> Float[np.ndarray, "M 2 3"]:
-    """The edges of frusta: from each center to the corners, and around them."""
-    ends = poses[:, None, :, 3] + np.einsum("kij,cj->kci", poses[:, :, :3], corners)
-    sides = np.stack((np.broadcast_to(poses[:, None, :, 3], ends.shape), ends), axis=2)
-    around = np.stack((ends, np.roll(ends, -1, axis=1)), axis=2)
-    return np.concatenate((sides, around), axis=1).reshape(-1, 2, 3)
+def beads(
+    positions: Float[np.ndarray, "N 3"], is_kept: Bool[np.ndarray, " N-1"]
+) -> tuple[Float[np.ndarray, "B 3"], Int[np.ndarray, " B"]]:
+    """Evenly spread points along the kept steps of a path, and the rows in which their steps end."""
+    if len(positions) < 2:
+        return positions, np.zeros(len(positions), int)
+    steps = np.where(is_kept, np.linalg.norm(np.diff(positions, axis=0), axis=1), 0.0)
+    walked = np.concatenate(((0.0,), np.cumsum(steps)))
+    at = np.linspace(0.0, walked[-1], BEADS)
+    points = np.stack([np.interp(at, walked, axis) for axis in positions.T], axis=1)
+    return points, np.searchsorted(walked, at)
 
 
 def nearest_to_ray(
@@ -238,12 +200,12 @@ def nearest_to_ray(
 
 def length_between(submap: dict[str, Any], rows: list[int]) -> tuple[float, float]:
     """Distance of two points and its standard error, NaN where it is unknown, by the errors of both and of the unit."""
-    between = np.diff(submap["points"].reshape(-1, 3)[rows].astype(float), axis=0)[0]
+    between = np.diff(submap["points"][rows].astype(float), axis=0)[0]
     length = float(np.linalg.norm(between))
     # The standard errors: of the float32 of a step the upper 16 bits, and lower triangles in these steps.
     steps = (submap["error_step"][rows].astype(np.uint32) << 16).view(np.float32).astype(float)
     L = np.zeros((2, 3, 3))
-    L[:, *np.tril_indices(3)] = submap["error_factor"].reshape(-1, 6)[rows]
+    L[:, *np.tril_indices(3)] = submap["error_factor"][rows]
     along = np.swapaxes(L, 1, 2) @ (between / max(length, MIN_SIZE))
     variances = np.where(steps > 0, steps**2 * (along**2).sum(axis=1), np.nan)
     return length, float(np.sqrt(variances.sum() + (length * submap["unit_std"]) ** 2))
@@ -257,9 +219,9 @@ def length_words(length: float, std: float, unit: str) -> str:
     return f"{length:.{digits}f} ± {std:.{digits}f} {unit or 'map units'}"
 
 
-def click_of(submap: dict[str, Any], size: tuple[int, int], row: int) -> str | None:
+def click_of(submap: dict[str, Any], row: int) -> str | None:
     """FRAME:X,Y of a point, as `--distance` takes it; None if no frame of the run shows it."""
-    x, y = (submap["seen_pixel"].reshape(-1, 2)[row] * (np.asarray(size) - 1) / PIXEL_STEPS).round(1)
+    x, y = (submap["seen_pixel"][row] * (np.asarray(submap["size"]) - 1) / PIXEL_STEPS).round(1)
     return f"{submap['seen_frame'][row]}:{x:g},{y:g}" if submap["seen_frame"][row] >= 0 else None
 
 

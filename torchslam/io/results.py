@@ -100,6 +100,11 @@ class SavedRun:
         return Map() if self.main is None else self.main.map
 
     @property
+    def breaks(self) -> list[str]:
+        """Where the check found the map broken, in words; empty without a check."""
+        return list(map(str, (self.metrics.get("check") or {}).get("breaks", ())))
+
+    @property
     def readout(self) -> Readout | None:
         """The readout of a rolling shutter; None for a global shutter."""
         return readout_of(self.metrics)

@@ -22,7 +22,7 @@ from torchslam.dense import PointCloud
 from torchslam.geometry import Camera, transform
 from torchslam.io.results import Results, read_results
 from torchslam.io.viewer import page as view_data
-from torchslam.io.viewer.page import encoded, page, write_view
+from torchslam.io.viewer.page import encoded, numbers, page, write_view
 from torchslam.system.run import Run
 from torchslam.types import State, Trajectory
 
@@ -67,7 +67,7 @@ def array(packed: dict[str, str], *shape: int) -> np.ndarray:
 
 def test_numbers_of_the_page_round_trip() -> None:
     for values, kind in (([1, -2], "int32"), ([255], "uint8"), ([0.1, np.nan], "float32"), ([], "float64")):
-        packed = json.loads(json.dumps(encoded(values, kind)))
+        packed = json.loads(json.dumps(numbers(values, kind), default=encoded))
         np.testing.assert_array_equal(decoded(packed), np.array(values, dtype=kind))
 
 

@@ -39,7 +39,7 @@ def draw(results: Results, directory: Path) -> list[Path]:
 
 def _figures(results: Results) -> Iterator[tuple[str, Figure]]:
     if results.frames:
-        yield "tracking", plot_tracking(results.frames)
+        yield "tracking", plot_tracking(results.frames, breaks=results.breaks)
     if not len(results.trajectory):
         return
     yield from _scenes(results)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -143,8 +144,11 @@ def plot_errors(
     return figure
 
 
-def plot_tracking(results: Sequence[StepResult], title: str = "") -> Figure:
-    """Map points matched per frame and those that agree with its pose; keyframes and lost spans marked."""
+def plot_tracking(results: Sequence[StepResult], title: str = "", breaks: Sequence[str] = ()) -> Figure:
+    """Map points matched per frame and those that agree with its pose; keyframes and lost spans marked.
+
+    breaks: those of the check, as in metrics.json
+    """
     origin = results[0].timestamp if results else 0.0
     seconds = np.array([result.timestamp for result in results]) - origin
     matches = np.array([result.matches for result in results], dtype=float)
@@ -157,6 +161,9 @@ def plot_tracking(results: Sequence[StepResult], title: str = "") -> Figure:
         axes.fill_between(seconds, matches, color=ESTIMATE, alpha=0.16, lw=0, label="matched")
         axes.plot(seconds, inliers, color=ESTIMATE, lw=1.2, label="agree with the pose")
         axes.plot(seconds[keyframes], inliers[keyframes], "o", ms=3.0, color=ACCENT, label="keyframe")
+        starts = [int(found[1]) for each in breaks if (found := re.search(r"between frames (\d+)", each))]
+        if (at := np.isin([result.index for result in results], starts)).any():
+            axes.vlines(seconds[at], 0, 1, "red", transform=axes.get_xaxis_transform(), label="break")
         axes.set(xlabel="time (s)", ylabel="map points in the frame", ylim=(0.0, None))
         posed = inliers > 0
         median = np.median(inliers[posed]) if posed.any() else 0.0

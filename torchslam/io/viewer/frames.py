@@ -197,8 +197,7 @@ class VideoRecorder(FrameViewer):
         small = cv2.resize(snapshot.image, self._size, interpolation=cv2.INTER_AREA)
         image, own = cv2.cvtColor(small, cv2.COLOR_GRAY2BGR), COLORS[result.state]
         for pixels, color, radius in ((snapshot.keypoints, (150, 150, 150), 1), (snapshot.tracked, own, 3)):
-            for x, y in (pixels * self._scale).round().int().tolist():
-                cv2.circle(image, (x, y), radius, color, 1, cv2.LINE_AA)
+            draw_keypoints(image, (pixels * self._scale).cpu().numpy(), color, radius)
         image = cv2.copyMakeBorder(image, 0, BAR, 0, 0, cv2.BORDER_CONSTANT, value=(24, 21, 19))
         words = f"{result.index}  {result.state.value}  {result.inliers or ''}  {result.reason}"
         place = (8, image.shape[0] - 8)
@@ -207,6 +206,14 @@ class VideoRecorder(FrameViewer):
 
     def close(self) -> None:
         self._writer.release()
+
+
+def draw_keypoints(
+    image: UInt8[np.ndarray, "H W 3"], pixels: Float[np.ndarray, "N 2"], color: tuple[int, ...], radius: int
+) -> None:
+    """Draw circles of a radius in pixels into an image."""
+    for center in np.round(pixels).astype(int).tolist():
+        cv2.circle(image, center, radius, color, 1, cv2.LINE_AA)
 
 
 def film_of(sequence: Sequence, directory: Path) -> VideoRecorder:

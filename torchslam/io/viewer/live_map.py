@@ -16,7 +16,7 @@ from torchslam.io.export.recording import gaps
 from torchslam.io.file_names import LIVE
 from torchslam.io.plots.charts import thin
 from torchslam.io.viewer.frames import tracked_pixels
-from torchslam.io.viewer.page import MAX_POINTS, clearest_observations
+from torchslam.io.viewer.page import MAX_POINTS, clearest_observations, image_corners
 from torchslam.system.slam import SLAM
 from torchslam.types import State, StepResult
 from torchslam.utils.files import PART, read_bytes
@@ -62,7 +62,7 @@ class LiveMap:
 
         Returns:
             frame, state, keyframe: of the last frame
-            camera: (6,) fx, fy, cx, cy, width, height
+            size, corners: (2,) width and height; (4, 3) rays through the corners of the image
             keypoints, tracked: (N, 2), (M, 2) pixels of the last frame, as of `FrameSnapshot`
             points: (P, 3) in the world of the map
             seen_frame, seen_pixel: (P,), (P, 2) a frame that was shown before with the point, -1 without one; pixels
@@ -77,7 +77,8 @@ class LiveMap:
             "frame": result.index,
             "state": result.state.value,
             "keyframe": result.is_keyframe,
-            "camera": np.array([*slam.camera.params[:4].tolist(), *slam.camera.size]),
+            "size": np.array(slam.camera.size),
+            "corners": image_corners(slam.camera.to("cpu")),
             "keypoints": empty if seen is None else seen.keypoints[seen.mask].float().cpu(),
             "tracked": tracked_pixels(slam, result.index).float().cpu(),
         }

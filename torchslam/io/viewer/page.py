@@ -6,7 +6,6 @@ import base64
 import html
 import json
 import re
-import sys
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -32,7 +31,14 @@ from torchslam.types import State, Trajectory
 from torchslam.utils.console import printable
 
 VIEW = "view.html"
-SCRIPTS = ("draw.js", "orbit.js", "scene.js", "ruler.js", "view.js")  # in this order, all in one script
+SCRIPTS = (
+    "detail.js",
+    "draw.js",
+    "orbit.js",
+    "scene.js",
+    "ruler.js",
+    "view.js",
+)  # in this order, all in one script
 MAX_POINTS = 150_000  # of all submaps together: 42 bytes each in the page
 MAX_DENSE_POINTS = 500_000  # of the dense cloud: 12 bytes each in the page
 STEPS = 65535  # of 16 bits: of the dense cloud over its extent, of pixels over the image
@@ -58,14 +64,14 @@ def page(results: Results) -> str:
         "title": html.escape(data["title"]),
         "css": asset["view.css"],
         # The data must not contain `</script>`.
-        "data": json.dumps(data, separators=(",", ":")).replace("<", "\\u003c"),
+        "data": json.dumps(data, separators=(",", ":"), default=encoded).replace("<", "\\u003c"),
         "script": "".join(asset[name] for name in SCRIPTS),
     }
     return re.sub(r"\{\{(\w+)\}\}", lambda found: parts[found[1]], asset["view.html"])
 
 
 def page_data(results: Results) -> dict[str, Any]:
-    """Return the data of the page for JSON, with arrays as `encoded`; deterministic.
+    """Return the data of the page; deterministic.
 
     `frames` has a row per displayed frame: index, seconds since the first one, state and so on. `submaps` has
     those with frames of the run, the main one first, see `_submap`.
@@ -86,16 +92,16 @@ def page_data(results: Results) -> dict[str, Any]:
         "title": printable(Path(metrics.get("source") or "torchslam").name),
         "facts": f"{len(results.frames)} frames, {metrics['posed']} posed{accuracy}{unit}{shutter}",
         "failure": printable(metrics.get("failure", "")),
-        "corners": _corners(results.camera).tolist(),
+        "corners": image_corners(results.camera).tolist(),
         "size": list(results.camera.size),
         "reasons": reasons,
         "frames": {
-            "index": encoded([frame.index for frame in frames], "int32"),
-            "seconds": encoded(times - times[:1], "float64"),
-            "state": encoded([states.index(frame.state) for frame in frames], "uint8"),
-            "keyframe": encoded([frame.is_keyframe for frame in frames], "uint8"),
-            "inliers": encoded([frame.inliers for frame in frames], "int32"),
-            "reason": encoded([number_of[frame.reason] for frame in frames], "int32"),
+            "index": numbers([frame.index for frame in frames], "int32"),
+            "seconds": numbers(times - times[:1], "float64"),
+            "state": numbers([states.index(frame.state) for frame in frames], "uint8"),
+            "keyframe": numbers([frame.is_keyframe for frame in frames], "uint8"),
+            "inliers": numbers([frame.inliers for frame in frames], "int32"),
+            "reason": numbers([number_of[frame.reason] for frame in frames], "int32"),
         },
         "submaps": [
             _submap(submap, paths[submap.number], results, times, int(budget * submap.map.num_points))
@@ -166,16 +172,16 @@ def _submap(
         "unit_std": submap.metric.relative_std if evaluation is None and submap.metric is not None else 0.0,
         "level": level,
         "S_shown_map": S.tolist(),
-        "frame": encoded(frame, "int32"),
-        "poses": encoded(shown[:, :3], "float32"),
-        "errors": encoded(errors[rows], "float32"),
+        "frame": numbers(frame, "int32"),
+        "poses": numbers(shown[:, :3], "float32"),
+        "errors": numbers(errors[rows], "float32"),
         "breaks": breaks,
         "path_length": float(steps.sum()),
-        "truth": encoded(truth, "float32"),
-        "keyframe": encoded(keyframe, "int32"),
-        "keyframe_poses": encoded(aligned(keyframes, S).T_wc[keyframe_rows][:, :3], "float32"),
-        "points": encoded(transform(S, points_w)[kept], "float32"),
-        "colors": encoded(colors[kept] if bool(colors.any()) else colors[:0], "uint8"),
+        "truth": numbers(truth, "float32"),
+        "keyframe": numbers(keyframe, "int32"),
+        "keyframe_poses": numbers(aligned(keyframes, S).T_wc[keyframe_rows][:, :3], "float32"),
+        "points": numbers(transform(S, points_w)[kept], "float32"),
+        "colors": numbers(colors[kept] if bool(colors.any()) else colors[:0], "uint8"),
         "points_total": len(points_w),
         **of_points(submap.map, ids[kept], S, results.session, results.camera.size),
         "dense": None if cloud is None else _dense(cloud, S, box),
@@ -199,8 +205,8 @@ def _dense(cloud: PointCloud, S: Float[Tensor, "4 4"], box: Float[Tensor, "2 3"]
     return {
         "low": low.tolist(),
         "step": step.tolist(),
-        "points": encoded(((points - low) / step).round(), "uint16"),
-        "colors": encoded(kept.colors, "uint8"),
+        "points": numbers(((points - low) / step).round(), "uint16"),
+        "colors": numbers(kept.colors, "uint8"),
         "total": len(cloud),
         "spacing": float(sim3_scale(S)) * kept.spacing(),
     }
@@ -229,7 +235,7 @@ def _shown_rows(
     return frame, row[frame]
 
 
-def _corners(camera: Camera) -> Float[Tensor, "4 3"]:
+def image_corners(camera: Camera) -> Float[Tensor, "4 3"]:
     """Return rays of unit depth through the image corners, in order around the image."""
     fx, fy, cx, cy = camera.params.double()[:4]
     x = (torch.tensor([0.0, 1, 1, 0], dtype=torch.float32, device="cpu") * (camera.width - 1) - cx) / fx
@@ -261,7 +267,7 @@ def of_points(
         upper = step.bfloat16().view(torch.int16).numpy().view(np.uint16)
         values = [frames, (pixels * steps).round().clamp(0, STEPS), upper, factor]
     names = {"seen_frame": "int32", "seen_pixel": "uint16", "error_step": "uint16", "error_factor": "int8"}
-    return {name: encoded(each, kind) for (name, kind), each in zip(names.items(), values, strict=True)}
+    return {name: numbers(each, kind) for (name, kind), each in zip(names.items(), values, strict=True)}
 
 
 def clearest_observations(
@@ -306,15 +312,12 @@ def error_factors(covariances: Float[Tensor, "N 3 3"]) -> tuple[Float[Tensor, " 
     return length, torch.where(known[:, None], steps[:, low, column], 0)
 
 
-def encoded(values: Num[Tensor, "*shape"] | np.ndarray | list[Any], kind: str) -> dict[str, str]:
-    """Encode numbers as base64 of their little-endian bytes, row by row."""
-    array = np.ascontiguousarray(np.asarray(values, dtype=kind))
-    if sys.byteorder == "big":
-        array = array.byteswap()
-    return {"type": kind, "data": base64.b64encode(array.tobytes()).decode("ascii")}
+def numbers(values: Num[Tensor, "*shape"] | np.ndarray | list[Any], kind: str) -> np.ndarray:
+    """Return numbers as an array of a type that the page knows."""
+    return np.ascontiguousarray(np.asarray(values, dtype=kind))
 
 
-def decoded(entry: dict[str, str]) -> np.ndarray:
-    """Decode the numbers of `encoded`, in one row."""
-    kind = np.dtype(entry["type"]).newbyteorder("<")
-    return np.frombuffer(base64.b64decode(entry["data"]), kind)
+def encoded(array: np.ndarray) -> dict[str, str]:
+    """Encode an array as base64 of its little-endian numbers, row by row."""
+    data = array.astype(array.dtype.newbyteorder("<")).tobytes()
+    return {"type": array.dtype.name, "data": base64.b64encode(data).decode("ascii")}

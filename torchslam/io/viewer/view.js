@@ -58,8 +58,8 @@ function build() {
   Object.values(layers).forEach(painter.remove);
   layers.dense = null;
   const points = submap.colors.length ? submap.colors : new Uint8Array(submap.points.length).map((_, i) => rgb("unpainted")[i % 3]);
-  layers.points = painter.points(submap.points, points);
-  if (submap.dense) layers.dense = painter.points(densePositions(submap.dense), submap.dense.colors);
+  layers.points = painter.points(...shuffled(submap.points, points));
+  if (submap.dense) layers.dense = painter.points(...shuffled(densePositions(submap.dense), submap.dense.colors));
   shown.finest = submap.points.length > 3e5 ? 1.3 : 2.6; // pixels: few points would hardly be seen
   const path = pathLines(submap.positions, (row) => submap.breaks.includes(row));
   shown.pathFrames = path.rows.map((row) => submap.frame[row]);
@@ -354,6 +354,7 @@ function listen() {
 }
 
 function begin() {
+  detail.rested = redraw;
   $("title").textContent = data.title;
   $("facts").textContent = data.facts;
   $("frame").max = Math.max(last, 0);

@@ -1,0 +1,115 @@
+"""Frames a second of the page of `torchslam app` with a large result, in headless Chromium: python -m experiments.benchmarks.page
+
+Needs Chromium, playwright and the extra `app`. Chromium draws in software, without a GPU.
+"""
+
+from __future__ import annotations
+
+import shutil
+import socket
+import tempfile
+import threading
+import time
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import psutil
+import uvicorn
+import viser
+from playwright.sync_api import sync_playwright
+
+from torchslam.app.jobs import Runs
+from torchslam.app.scene import Scene
+from torchslam.app.web import Uploads, application
+
+KEYFRAMES, DENSE, FRAMES, THUMBNAILS = 2000, 500_000, 18_000, 48  # as of 2 million points, of which as many are sent
+ARGUMENTS = ["--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
+SECONDS = 20.0  # of dragging, after those in which the number of points settles
+# Counts the points of the largest cloud in each frame that is drawn; installed before the page's own script.
+COUNT = """(() => {
+  const {prototype: gl} = WebGL2RenderingContext, draw = gl.drawArrays;
+  window.drawn = [];
+  let most = 0;
+  gl.drawArrays = function (mode, first, count) {
+    if (mode === gl.POINTS) most = Math.max(most, count);
+    draw.call(this, mode, first, count);
+  };
+  requestAnimationFrame(function look(now) {
+    if (most) window.drawn.push([now, most]);
+    most = 0;
+    requestAnimationFrame(look);
+  });
+})()"""
+
+
+def large_result() -> dict[str, Any]:
+    """A walk of several rounds in a hall, in the form of `reading.result`."""
+    random = np.random.default_rng(0)
+    turns = np.linspace(0, 8 * np.pi, FRAMES)
+    poses = np.tile(np.eye(3, 4, dtype=np.float32), (FRAMES, 1, 1))
+    poses[:, :, 3] = np.stack((np.cos(turns), np.sin(turns), 0.02 * turns), axis=1)
+    points = random.integers(0, 65536, (DENSE, 3)).astype(np.uint16)
+    points[np.arange(DENSE), random.integers(0, 3, DENSE)] = 0  # three walls
+    colors = random.integers(0, 256, (DENSE, 3)).astype(np.uint8)
+    rows = np.linspace(0, FRAMES - 1, KEYFRAMES).astype(int)
+    corners = np.array([[-0.6, -0.4, 1], [0.6, -0.4, 1], [0.6, 0.4, 1], [-0.6, 0.4, 1]])
+    return {
+        "radius": 2.0,
+        "poses": poses,
+        "uncertain": np.zeros(FRAMES, bool),
+        "breaks": [],
+        "truth": np.zeros((0, 3)),
+        "keyframe_poses": poses[rows],
+        "corners": 0.07 * corners,
+        "images": {row: colors[: 72 * 96].reshape(72, 96, 3) for row in range(0, KEYFRAMES, KEYFRAMES // THUMBNAILS)},
+        "points": np.zeros((0, 3), np.float32),
+        "colors": np.zeros((0, 3), np.uint8),
+        "dense": {"low": [-2, -2, -1], "step": [4 / 65535] * 2 + [2 / 65535], "points": points, "colors": colors},
+    }
+
+
+def main() -> None:
+    """Serve the result, drag the view, and print a row of the table."""
+    viewer = viser.ViserServer("127.0.0.1", 0, verbose=False)
+    listening, nobody = socket.create_server(("127.0.0.1", 0)), SimpleNamespace()
+    with tempfile.TemporaryDirectory() as folder, sync_playwright() as playwright:
+        page_of_viewer: Any = application(viewer, Runs(Path(folder)), Uploads(Path(folder), 1), nobody)
+        options: dict[str, Any] = {"log_level": "warning", "ws": "websockets-sansio"}
+        server = uvicorn.Server(uvicorn.Config(page_of_viewer, **options))
+        threading.Thread(target=server.run, kwargs={"sockets": [listening]}, daemon=True).start()
+        Scene(viewer).show_result(large_result())
+        chromium = shutil.which("chromium") or shutil.which("google-chrome")
+        browser = playwright.chromium.launch(executable_path=chromium, args=ARGUMENTS)
+        page = browser.new_page(viewport={"width": 1280, "height": 800})
+        page.add_init_script(COUNT)
+        page.goto(f"http://localhost:{listening.getsockname()[1]}/")
+        page.wait_for_function("window.drawn.some(([, count]) => count > 5000)", timeout=300_000)
+        page.mouse.move(400, 400)
+        page.mouse.down()
+        for name, seconds in (("settling", SECONDS), ("moving", SECONDS)):
+            page.evaluate("window.drawn.length = 0")
+            busy, end, step = psutil.cpu_times(), time.monotonic() + seconds, 0
+            while time.monotonic() < end:
+                step += 1
+                page.mouse.move(400 + (7 * step) % 300, 400 + (3 * step) % 100)
+                page.wait_for_timeout(15)
+            drawn, after = np.array(page.evaluate("window.drawn")), psutil.cpu_times()
+            rate = 1000 * (len(drawn) - 1) / max(1.0, drawn[-1, 0] - drawn[0, 0])
+            share = 1 - (after.idle - busy.idle) / (seconds * (psutil.cpu_count() or 1))
+            print(f"{name}: {rate:.1f} frames a second, {np.median(drawn[:, 1]):.0f} points; machine {share:.0%} busy")
+        page.mouse.up()
+        page.evaluate("window.drawn.length = 0")
+        page.wait_for_timeout(6000)
+        drawn = np.array(page.evaluate("window.drawn"))
+        memory = psutil.Process().memory_info().rss / 1e6
+        print(f"at rest: {drawn[:, 1].max():.0f} points; memory of the server {memory:.0f} MB; load {psutil.getloadavg()}")
+        page.screenshot(path="/tmp/h/a/page.png")
+        browser.close()
+        server.should_exit = True
+    viewer.stop()
+
+
+if __name__ == "__main__":
+    main()

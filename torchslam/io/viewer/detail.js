@@ -1,0 +1,71 @@
+/* Levels of detail, of view.html and of `torchslam app`.
+ *
+ * Large clouds, and frusta as a mesh of lines, come in random order. While the view moves, only a first part of them is
+ * drawn, as much as the renderer draws at 20 frames a second; at rest ten times as much: without a GPU half a second's.
+ */
+const detail = { rested() {} }; // called when the view rests and its last frame was not drawn in full
+(() => {
+  const gl = WebGL2RenderingContext.prototype;
+  const [FRAME_MS, AT_REST, IDLE, LEAST] = [45, 10, 10, 6000]; // times as many points; frames; points
+  const FRUSTUM = { vertices: 24, points: 200 }; // of its lines; points that take as long
+  let [limit, largest, isResting, isCut, drawn, idle, before] = [20000, 0, false, false, 0, 0, -1];
+
+  function allowed(mode, count) {
+    if (before < 0) {
+      [isResting, before] = [true, performance.now()]; // the first frame after a pause
+      requestAnimationFrame(look);
+    }
+    const isPoints = mode === gl.POINTS;
+    const points = isPoints ? count : mode === gl.LINES ? (count / FRUSTUM.vertices) * FRUSTUM.points : 1;
+    largest = Math.max(largest, points);
+    const most = Math.max(LEAST, limit * (isResting ? AT_REST : 1));
+    if (points <= most) return count;
+    isCut = !isResting;
+    return isPoints ? Math.floor(most) : FRUSTUM.vertices * Math.ceil(most / FRUSTUM.points);
+  }
+
+  /** Before each refresh of the screen, from the first frame that is drawn to some time after the last one. */
+  function look(now) {
+    if (largest && drawn > 2) {
+      // The frames before wait for what was drawn in the pause.
+      const factor = Math.max(0.5, Math.min(1.15, Math.sqrt(FRAME_MS / (now - before))));
+      if (factor < 1 || largest > limit) limit = Math.max(LEAST, Math.min(limit, largest) * factor);
+    }
+    [drawn, idle, isResting] = largest ? [drawn + 1, 0, false] : [drawn, idle + 1, isResting];
+    [largest, before] = [0, now];
+    if (idle < IDLE) return requestAnimationFrame(look);
+    [drawn, idle, before] = [0, 0, -1];
+    if (isCut) detail.rested();
+    isCut = false;
+  }
+
+  for (const [name, at] of [["drawArrays", 2], ["drawElements", 1]]) {
+    const draw = gl[name];
+    gl[name] = function (...words) {
+      words[at] = allowed(words[0], words[at]);
+      draw.apply(this, words);
+    };
+  }
+  // Smooth edges take four times as long where there is no GPU.
+  const probe = document.createElement("canvas").getContext("webgl2");
+  const named = probe?.getExtension("WEBGL_debug_renderer_info")?.UNMASKED_RENDERER_WEBGL;
+  if (named && /swiftshader|llvmpipe|software/i.test(probe.getParameter(named))) {
+    const get = HTMLCanvasElement.prototype.getContext;
+    HTMLCanvasElement.prototype.getContext = function (kind, options) {
+      return get.call(this, kind, /^webgl/.test(kind) ? { ...options, antialias: false } : options);
+    };
+  }
+  probe?.getExtension("WEBGL_lose_context")?.loseContext();
+})();
+
+/** The same points in random order. positions: 3 floats, colors: 3 bytes a point. */
+function shuffled(positions, colors) {
+  const [order, seed] = [Uint32Array.from({ length: positions.length / 3 }, (_, i) => i), [1]];
+  for (let i = order.length - 1; i > 0; i--) {
+    seed[0] = (Math.imul(seed[0], 1664525) + 1013904223) >>> 0;
+    const j = Math.floor((seed[0] / 2 ** 32) * (i + 1));
+    [order[i], order[j]] = [order[j], order[i]];
+  }
+  const rows = (values) => values.map((_, i) => values[3 * order[Math.floor(i / 3)] + (i % 3)]);
+  return [rows(positions), rows(colors)];
+}
