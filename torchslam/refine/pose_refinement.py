@@ -251,8 +251,8 @@ class _Refinement:
             more = f" or {len(others) - NAMED} more" if len(others) > NAMED else ""
             hint = f"these{more} fit equally, which more images may decide; convert the poses as they were written"
         raise TrajectoryError(
-            f"{given.path}: {share:.0%} of {len(pairs)} image pairs agree with the poses as {of_format}, but {fitting}: "
-            f"{hint}"
+            f"{given.path}: {share:.0%} of {len(pairs)} image pairs agree with the poses as {of_format}, but "
+            f"{fitting}: {hint}"
         )
 
     @torch.no_grad()
