@@ -409,7 +409,7 @@ def test_opencv_files_say_whether_they_are_of_a_fisheye(tmp_path: Path, suffix: 
         (
             "a.json",
             NERFSTUDIO.replace('"images/0.png"', '"images/0.png", "k1": 0.3'),
-            "frame images/0.png has a k1 of its own",
+            "different cameras: k1 is 0.1 of all frames, 0.3 of images/0.png",
         ),
         (
             "a.json",
@@ -474,6 +474,19 @@ def test_keys_that_are_no_other_distortion(tmp_path: Path, name: str, text: str)
 def test_angle_of_a_blender_scene(tmp_path: Path) -> None:
     (tmp_path / "t.json").write_text(f'{{"camera_angle_x": {math.pi / 2}, "w": 640, "h": 480, "frames": []}}')
     assert read_calibration(tmp_path / "t.json").params == pytest.approx([320, 320, 319.5, 239.5])
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ('{"camera_angle_x": 40, "w": 640, "h": 480, "frames": []}', "camera_angle_x is 40, no angle"),
+        ('{"fx": 0.8, "fy": 1.1, "cx": 0.5, "cy": 0.5}', "0.8 and 1.1 pixels: are they parts of the width"),
+    ],
+)
+def test_focal_lengths_in_other_units(tmp_path: Path, text: str, message: str) -> None:
+    (tmp_path / "t.json").write_text(text)
+    with pytest.raises(CalibrationError, match=f"t.json: .*{message}"):
+        read_calibration(tmp_path / "t.json")
 
 
 def test_a_decimal_comma_does_not_cut_a_number(tmp_path: Path) -> None:

@@ -60,6 +60,9 @@ def test_words_for_an_unknown_number(text: str) -> None:
         ("longitude", "field.longitude", math.nan),
         ("altitude", "altitude (feet)", 0.3048),
         ("altitude", "Altitude_m", 1.0),
+        ("altitude", "altitude_msl_ft", 0.3048),
+        ("altitude", "Alt (m AMSL)", 1.0),
+        ("altitude", "altitude accuracy [m]", None),
         ("altitude", "home_altitude", None),
         ("std_horizontal", "horizontalAccuracy", math.nan),
     ],
@@ -86,11 +89,12 @@ def test_an_unknown_unit_is_refused() -> None:
         'sep=;\n"time";"speed (km/h)"\n0;5,4\n2;"10,8"\n',
         "# a logger\n#time speed\n0 1.5\n2 3\n",
         "# a logger's file\n0,1.5\n2,3\n",
-        "\ufeff\n\nTime [s]\tSpeed [m/s]\n0\t1.5\n2\t3\t\n\n",
+        "\n\nTime [s]\tSpeed [m/s]\n0\t1.5\n2\t3\t\n\n",  # Excel's Unicode text
+        "\ufefftime,speed\n1970-01-01 00:00:00 UTC,1.5\n2,3\n",
     ],
 )
 def test_tables_of_many_programs(tmp_path: Path, text: str) -> None:
-    (tmp_path / "a.csv").write_text(text, encoding="utf-8")
+    (tmp_path / "a.csv").write_text(text, encoding="utf-16" if "\t" in text else "utf-8")
     columns = TIMES | {"speed": SPEED}
     rows = list(read_table(tmp_path / "a.csv", columns, MeasurementError, unnamed=("time", "speed")))
     assert [(row.time(), pytest.approx(row.number("speed"))) for row in rows] == [(0.0, 1.5), (2.0, 3.0)]
@@ -112,6 +116,7 @@ def test_rows_with_a_cell_more_are_refused_unless_they_have_names(tmp_path: Path
         ("latitude", [48.1, 0.0, -180.0, 999.0, 91.0, 214.7483647, 48.2], [1, 2, 3, 4, 5]),
         ("latitude", [1e-5, 0.0, 2e-5], []),
         ("longitude", [99.98, 99.99, 99.985], []),
+        ("altitude", [100.0, 100.0, 1000.0, 30.48], []),  # 10000 cm, 100000 cm, 10000 tenths of an inch
         ("std_horizontal", [4.0, 99.99, 9999.0], [1, 2]),
     ],
 )
@@ -132,6 +137,7 @@ def test_speeds_of_vehicles_that_back_up() -> None:
         True,
     ]
     assert np.isnan(SPEED.known([3.0, -3.6 / 3.6, -1.2])[0]).sum() == 0
+    assert np.isnan(SPEED.known([10.0, 98 / 3.6, 99 / 3.6, 100 / 3.6, 100.0])[0]).sum() == 0
     assert SPEED.known([30.0, -2.2369 * 0.44704])[1] == "-0.999984 (1 times)"
     assert SPEED.known([])[0].tolist() == []
 

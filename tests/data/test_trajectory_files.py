@@ -58,6 +58,16 @@ def test_bad_line(tmp_path: Path, line: str, message: str) -> None:
         read_trajectory(file)
 
 
+def test_a_comment_with_another_order_of_the_columns_is_refused(tmp_path: Path) -> None:
+    for names in (
+        "timestamp tx ty tz qw qx qy qz",
+        "timestamp [ns], p_x [m], p_y [m], p_z [m], q_RS_w [], q_RS_x []",
+    ):
+        (tmp_path / "t.txt").write_text(f"# {names}\n0 0 0 0 1 0 0 0\n")
+        with pytest.raises(TrajectoryError, match="quaternions begin with qw"):
+            read_trajectory(tmp_path / "t.txt")
+
+
 def test_empty_and_missing(tmp_path: Path) -> None:
     (tmp_path / "empty.txt").write_text("# nothing\n")
     with pytest.raises(TrajectoryError, match=r"empty\.txt: is empty; expected"):

@@ -17,6 +17,8 @@ COUNTS = {"pinhole": (4,), "radial_tangential": (8, 9), "rational": (12,), "fish
 """Numbers of parameters that a text may have, by camera model."""
 NUMBERS = "fx fy cx cy [k1 k2 p1 p2 [k3 [k4 k5 k6]]], or `fisheye` and fx fy cx cy k1 k2 k3 k4"
 Size = tuple[int, int]
+LEAST_FOCAL_PX = 3.0
+"""A tenth of the width of the smallest image that is read; parts of a width are .2 to 2. Tried at this value only."""
 MAX_OFF_CENTER = 0.08
 """Largest distance of the principal point from the middle, in longer sides of the image, without a stated size.
 
@@ -68,6 +70,11 @@ class Calibration:
         if numbers[0] <= 0 or numbers[1] <= 0:
             raise CalibrationError(
                 f"{source}: focal lengths must be positive, got {numbers[0]:g} and {numbers[1]:g}"
+            )
+        if min(numbers[:2]) < LEAST_FOCAL_PX:
+            raise CalibrationError(
+                f"{source}: focal lengths of {numbers[0]:g} and {numbers[1]:g} pixels: are they parts of the width or "
+                "of the height of the image? Give pixels"
             )
         if size is not None and min(size) <= 0:
             raise CalibrationError(

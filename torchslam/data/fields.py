@@ -9,8 +9,9 @@ import math
 
 from torchslam.data.tables import TIMES, Column, Unknown
 
-NINES = [sign * (10**n - 10**-k) for sign in (1, -1) for n in range(2, 6) for k in range(4)]
-"""99.99 and -9999: fields filled with nines, as of NMEA's dilution, netCDF and terrain models."""
+NINES = [sign * (10**n - 10**-k) for sign in (1, -1) for n in range(2, 6) for k in range(min(4, 7 - n))]
+"""99.99 and -9999: fields filled with nines, as of NMEA's dilution, netCDF and terrain models. At most six of them, or
+they would be powers of ten in another unit, rounded."""
 LIMITS = [-32768, 32767, 65535, 655.35, 65.535, -(2**31), 2**31 - 1, 2**32 - 1, 214.7483647, -214.7483648]
 """Largest integers: MAVLink's and FIT's invalid ones, also in cm and mm; the last ones in 1e-7 degrees."""
 
@@ -56,7 +57,7 @@ POSITION_COLUMNS = {
     "east": Column(spelled("ew", "longituderef", "lonref", "longitudeew", "lonew", "longitudehemisphere")),
 }
 SPEEDS = {
-    **dict.fromkeys(("ms", "mps", "msec", "ms1"), 1.0),
+    **dict.fromkeys(("ms", "mps", "msec", "ms1", "meterssecond"), 1.0),
     **dict.fromkeys(("kmh", "kph", "kmph"), 1 / 3.6),
     **dict.fromkeys(("mph", "mih"), 0.44704),
     **dict.fromkeys(("kn", "kt", "kts", "knot", "knots"), 1852 / 3600),
@@ -67,8 +68,9 @@ SPEEDS = {
 """Factors to m/s."""
 # Of iOS, also as other units are rounded.
 _AS_MINUS_ONE = [-round(1 / factor, digits) for factor in {*SPEEDS.values()} for digits in range(1, 7)]
-NO_SPEED = Unknown((*_AS_MINUS_ONE, *NINES, *LIMITS), near=0.25)
-"""Of speeds: -1 m/s, and -9999. A vehicle that backs up has others around them; one that stands errs by .1."""
+NO_SPEED = Unknown((*_AS_MINUS_ONE, *NINES, *LIMITS), near=0.3)
+"""Of speeds: -1 m/s, and -9999. A vehicle that backs up, or drives at 99 km/h, has others around them; one that stands
+errs by .1."""
 SPEED = Column(spelled("speed", "velocity", "groundspeed", "speed3d", "3dspeed"), SPEEDS, NO_SPEED)
 NO_SAMPLE = Unknown((*NINES, *LIMITS), near=1.0)
 """Of rates and forces, rad/s and m/s^2: fill values and the largest integers."""

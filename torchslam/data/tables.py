@@ -63,19 +63,25 @@ class Column(NamedTuple):
         """
         words = re.sub(r"(?<=[a-z])(?=[A-Z])", " ", heading).lower().replace("²", "2")
         found = re.fullmatch(r"(.*?)[\[(]([^\[\]()]*)[\])]?\W*", words)
-        parts = [part for part in re.split(r"[^a-z0-9µ°]+", found[1] if found else words) if part]
-        stated = re.sub(r"[^a-z0-9µ°]", "", found[2]) if found else ""
-        for length in range(len(parts), 0, -1):
-            unit = stated or "".join(parts[length:])
+        parts, stated = (
+            [part for part in re.split(r"[^a-z0-9µ°]+", text) if part]
+            for text in (found.groups() if found else (words, ""))
+        )
+        for length in range(len(parts), len(parts) - 1 if stated else 0, -1):
+            unit = stated or parts[length:]
             if "".join(parts[:length]) not in self.names:
                 continue
-            if stated and stated not in self.units:
+            # `km/h` is one unit, `m AMSL` one with a word that is none.
+            each = [self.units.get(word) for word in unit]
+            factors = [factor for factor in each if factor is None or not math.isnan(factor)]
+            factor = self.units.get("".join(unit), (factors or [math.nan])[0] if len(factors) < 2 else None)
+            if stated and factor is None:
                 known = ", ".join(self.units) or "none"
                 raise error(
-                    f"{where}: column `{heading[:80]}`: the unit `{unit}` is not known; known are {known}"
+                    f"{where}: column `{heading[:80]}`: the unit `{''.join(unit)}` is not known; known are {known}"
                 )
-            if not unit or unit in self.units:
-                return self.units[unit] if unit else math.nan
+            if factor is not None:
+                return factor
         return None
 
     def known(self, values: Sequence[float] | np.ndarray) -> tuple[np.ndarray, str]:

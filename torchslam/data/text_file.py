@@ -191,7 +191,7 @@ def utc_from_gps(seconds: float) -> float:
 def parse_moment(text: str) -> float | None:
     """Seconds since 1970 of a date and time as in ISO 8601, UTC without a zone; None for anything else."""
     try:
-        moment = datetime.datetime.fromisoformat(text.strip())
+        moment = datetime.datetime.fromisoformat(text.strip().removesuffix(" UTC"))
     except ValueError:
         return None
     return (moment if moment.tzinfo else moment.replace(tzinfo=datetime.UTC)).timestamp()

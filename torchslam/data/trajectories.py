@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -9,7 +10,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchslam.data.text_file import check_rising, float64, in_seconds, number_rows
+from torchslam.data.text_file import check_rising, float64, in_seconds, number_rows, read_text
 from torchslam.errors import TrajectoryError
 from torchslam.geometry.lie import matrix_from_quaternion, quaternion_from_matrix, rigid, se3_interpolate
 from torchslam.types import Trajectory
@@ -24,8 +25,12 @@ def read_trajectory(path: str | Path) -> Trajectory:
     """Read a TUM trajectory file; `#` starts a comment.
 
     Raises TrajectoryError naming file and line: a missing or empty file, not eight finite numbers, a
-    quaternion far from unit length, timestamps out of order or doubled.
+    quaternion far from unit length, timestamps out of order or doubled, a comment with another order of the columns.
     """
+    if re.search(r"(?m)^#.*\bq\w*w\b\W+q\w*x\b", read_text(path, TrajectoryError)):
+        raise TrajectoryError(
+            f"{path}: quaternions begin with qw, as a comment says; the columns must be {COLUMNS}"
+        )
     places, rows = zip(*number_rows(path, COLUMNS, TrajectoryError), strict=True)
     times = [in_seconds(row[0], where, TrajectoryError) for where, row in zip(places, rows, strict=True)]
     check_rising(times, places, TrajectoryError)

@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
 from torchslam.data.calibration import size_text
-from torchslam.data.formats.frame_names import in_order
+from torchslam.data.formats.frame_names import files_in, in_order
 from torchslam.data.formats.image_file import MAX_PIXELS, SUFFIXES, has_transparency, read_gray
 from torchslam.data.sequence import Sequence, Transformed
 from torchslam.errors import FrameError, SequenceError
@@ -232,9 +232,7 @@ def _by_frame(folder: Path, sequence: Sequence) -> dict[int, Path]:
     """Return the mask file of each frame."""
     if sequence.known_length is None:
         raise SequenceError(f"{folder}: a live source takes one mask for all frames")
-    files = in_order(
-        file for file in folder.iterdir() if file.suffix.lower() in SUFFIXES and not file.name.startswith(".")
-    )
+    files = in_order(file for file in files_in(folder, SUFFIXES) if not file.name.startswith("."))
     by_name = {file.stem: file for file in files}
     names = [Path(sequence.image_name(index)) for index in range(len(sequence))]
     named = {index: by_name.get(name.name) or by_name.get(name.stem) for index, name in enumerate(names)}

@@ -30,7 +30,6 @@ from torchslam.geometry.ransac import (
     count_distinct,
     gather_rows,
     is_significant,
-    leave_a_line,
     levenberg_marquardt,
     pose_rows,
     retract_pose,
@@ -50,6 +49,8 @@ CANDIDATES = 2  # hypotheses of each round that are optimized
 LOCAL_ITERATIONS, FINAL_ITERATIONS = 1, 10
 """Of a hypothesis within the search, which only ranks it, and of the final refinement. Tried at these values only."""
 FINAL_WIDTH = 1.5  # thresholds, for the tail of the noise; without this refinement more runs are lost
+MAX_TURN_STD = math.radians(1.5)
+"""Largest standard error of the rotation, radians, for noise of half a threshold: three of them are 5 degrees."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,7 +60,7 @@ class AbsolutePose(ByValue):
     Attributes:
         T_cw: world to camera; the identity where there is no pose.
         inliers: points within the threshold of their pixel, in front of the camera.
-        success: whether the inliers are significant and not all on one line.
+        success: whether the inliers are significant and determine the rotation to 5 degrees (MAX_TURN_STD).
         score: sum over the points of 1 - min((error / threshold)^2, 1).
     """
 
@@ -86,7 +87,7 @@ def estimate_absolute_pose(
     The same arguments and seed give the same result. Where an input requires a gradient, T_cw carries that of the final
     least squares with respect to points, pixels and camera parameters, with the set of rows it uses fixed (implicit
     function theorem, exact Hessian). Sources: Fischler and Bolles, 1981; Chum et al., "Locally optimized RANSAC", 2003;
-    for P3P see `p3p`. Too few points, points on a line, or pure noise give `success` False.
+    for P3P see `p3p`. Too few points, points on a line or on too small a plane, and pure noise give `success` False.
 
     Args:
         camera: one for all, or a batch of B.
@@ -318,17 +319,25 @@ class _Search:
     def is_success(
         self, P: Float[Tensor, "B 3 4"], inliers: Bool[Tensor, "B N"], size: tuple[int, int], threshold: float
     ) -> Bool[Tensor, " B"]:
-        """Test whether inliers are significant and fix the pose: four or more distinct points, not on a line."""
+        """Test whether inliers are significant and determine the rotation: repeated points count once."""
         points_c = torch.where(inliers[..., None], (P @ self.homogeneous).mT, 1.0)
         depth = points_c[..., 2:]
+        xy, scale = points_c[..., :2] / depth, self.scale.mean(-1, keepdim=True)
         # Thresholds in the image, and as much in depth.
-        places = torch.cat((points_c[..., :2] / depth, depth.log()), dim=-1) * self.scale.mean(
-            -1, keepdim=True
+        distinct, available = count_distinct(
+            torch.cat((xy, depth.log()), dim=-1) * scale, inliers, self.mask.sum(-1)
         )
         chance = torch.full_like(
             inliers[:, 0], math.pi * threshold**2 / (size[0] * size[1]), dtype=torch.float64
         )
-        significant = is_significant(
-            *count_distinct(places, inliers, self.mask.sum(-1)), 3, chance, solutions=4
-        )
-        return significant & leave_a_line(self.points, inliers)
+        significant = is_significant(distinct, available, 3, chance, solutions=4)
+        # Information of the inliers in thresholds, with the mean depth as the unit, and a prior of one on everything.
+        count = inliers.sum(-1)[:, None, None].clamp_min(1)
+        eye = torch.eye(6, dtype=P.dtype, device=P.device)
+        unit = (depth * inliers[..., None]).sum(1, keepdim=True) / count
+        J = torch.cat((eye[:2, :2].expand(*xy.shape, 2), -xy[..., None]), dim=-1) * (unit / depth)[..., None]
+        rows = pose_rows(J, points_c / unit) * (scale * inliers[..., None])[..., None]
+        rows = rows.flatten(1, 2)
+        information = rows.mT @ rows * (distinct[:, None, None] / count)
+        covariance = torch.linalg.inv_ex(information + eye)[0]  # NaN without a pose, which is not below
+        return significant & (covariance[:, range(3, 6), range(3, 6)].sum(-1).sqrt() < 2 * MAX_TURN_STD)

@@ -59,8 +59,8 @@ IMPROVED = 0.9
 improve on the given poses; two maps of one recording by different features differ by 5 %."""
 MORE_AGREE = 0.05
 """By how much the share of pairs that agree must grow to count as improved, whatever their distance."""
-
-
+NAMED = 3
+"""Conventions that a message names at most, of those that fit equally. Tried at this value only."""
 MAX_TURNED = 30.0
 """Median angle, degrees, between given and refined orientations from which on nothing relates the frames of both.
 Tried at this value only."""
@@ -235,17 +235,24 @@ class _Refinement:
         pixels_1 = torch.stack([pixels(pair.first, pair.keypoints_1) for pair in pairs])
         pixels_2 = torch.stack([pixels(pair.second, pair.keypoints_2) for pair in pairs])
         ends = torch.tensor([(pair.first, pair.second) for pair in pairs], device=poses.device)
-        share, other = fitting_reading(
+        share, others = fitting_reading(
             poses, given.is_world_to_camera, ends, pixels_1.to(poses), pixels_2.to(poses), self.mapper.camera
         )
-        if other is None:
+        if not others:
             return
         of_format = "world to camera" if given.is_world_to_camera else "camera to world"
         axes = torch.eye(3, dtype=poses.dtype, device=poses.device)
         axes = opengl(rigid(axes, axes[0]))[:3, :3] if given.kind == NERFSTUDIO else axes
+        fitting = "; or ".join(
+            f"{each.share:.0%} as {each.sentence(of_format, axes)}" for each in others[:NAMED]
+        )
+        hint = "convert them"
+        if len(others) > 1:
+            more = f" or {len(others) - NAMED} more" if len(others) > NAMED else ""
+            hint = f"these{more} fit equally, which more images may decide; convert the poses as they were written"
         raise TrajectoryError(
             f"{given.path}: {share:.0%} of {len(pairs)} image pairs agree with the poses as {of_format}, but "
-            f"{other.share:.0%} as {other.sentence(of_format, axes)}: convert them"
+            f"{fitting}: {hint}"
         )
 
     @torch.no_grad()

@@ -6,6 +6,7 @@ which have no end. What is written survives even if the program is killed.
 
 from __future__ import annotations
 
+import codecs
 import errno
 import hashlib
 import json
@@ -59,8 +60,17 @@ def read_bytes(path: str | Path, limit: int, what: str) -> bytes:
 
 
 def read_text(path: str | Path, limit: int, what: str) -> str:
-    """Read a regular UTF-8 file, with line ends `\\n`. Raises OSError as `read_bytes`, ValueError for invalid UTF-8."""
-    text = read_bytes(path, limit, what).decode("utf-8-sig")
+    """Read a regular file in UTF-8, or in UTF-16 with a mark of the order of its bytes, with line ends `\\n`.
+
+    Raises OSError as `read_bytes`, ValueError for another encoding.
+    """
+    content = read_bytes(path, limit, what)
+    is_utf_16 = content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
+    try:
+        text = content.decode("utf-16" if is_utf_16 else "utf-8-sig")
+    except UnicodeDecodeError as cause:
+        place = f"byte {cause.start} is {content[cause.start]:#04x}"
+        raise ValueError(f"not a text in UTF-8 ({place}); save it in that encoding") from None
     return text.replace("\r\n", "\n").replace("\r", "\n") if "\r" in text else text
 
 

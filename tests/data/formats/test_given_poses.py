@@ -125,6 +125,13 @@ def test_images_are_matched_by_their_times() -> None:
             json.dumps({"frames": [{"file_path": "a", "transform_matrix": np.diag([1, 1, -1, 1]).tolist()}]}),
             r"frame a: 1 of 1 poses are mirrored \(determinant -1\)",
         ),
+        (
+            "transforms.json",  # as ARKit's and Unity's matrices, whose columns are rows elsewhere
+            json.dumps(
+                {"frames": [{"file_path": "a", "transform_matrix": np.eye(4)[[0, 1, 2, 0]].tolist()}]}
+            ),
+            "frame a: the last row of transform_matrix is not 0 0 0 1",
+        ),
         ("images.txt", "1 1 0 0 0 0 0 0 1\n", "expected `id qw"),
         ("images.txt", "1 3 0 0 0 0 0 0 1 a.png\n\n", "unit length"),
         ("images.txt", "# nothing\n", "no images"),
@@ -142,23 +149,36 @@ def test_invalid_poses_are_refused(tmp_path: Path, name: str, content: str | byt
 def test_several_cameras_are_too_many(tmp_path: Path) -> None:
     """Those that the images have, and that differ; with a camera of the user's own they do not matter."""
     (tmp_path / "images.txt").write_text("1 1 0 0 0 0 0 0 1 a.png\n\n2 1 0 0 0 1 0 0 2 b.png\n\n")
-    for second, message in (("2 PINHOLE 4 4 1 2 2 2", "2 cameras"), ("3 PINHOLE 4 4 1 1 2 2", "no camera 2")):
-        (tmp_path / "cameras.txt").write_text(f"1 PINHOLE 4 4 1 1 2 2\n{second}\n")
+    for second, message in (
+        ("2 PINHOLE 4 4 10 20 2 2", "2 cameras"),
+        ("3 PINHOLE 4 4 10 10 2 2", "no camera 2"),
+    ):
+        (tmp_path / "cameras.txt").write_text(f"1 PINHOLE 4 4 10 10 2 2\n{second}\n")
         with pytest.raises(CalibrationError, match=message):
             read_poses(tmp_path)
         assert read_poses(tmp_path, with_camera=False).calibration is None
-    lines = "1 PINHOLE 4 4 1 1 2 2\n2 PINHOLE 4 4 1 1 2 2\n3 PINHOLE 4 4 9 9 2 2\n"
+    lines = "1 PINHOLE 4 4 10 10 2 2\n2 PINHOLE 4 4 10 10 2 2\n3 PINHOLE 4 4 9 9 2 2\n"
     (tmp_path / "cameras.txt").write_text(lines)
-    assert params_of(read_poses(tmp_path), Camera.pinhole(1, 1, 1.5, 1.5, size=(4, 4))) == [1, 1, 1.5, 1.5]
+    assert params_of(read_poses(tmp_path), Camera.pinhole(10, 10, 1.5, 1.5, size=(4, 4))) == [
+        10,
+        10,
+        1.5,
+        1.5,
+    ]
 
 
 def test_several_cameras_of_a_binary_model(tmp_path: Path) -> None:
     (tmp_path / "images.bin").write_bytes(
         struct.pack("<QI7dI", 1, 1, 1, 0, 0, 0, 0, 0, 0, 2) + b"a.png\0" + struct.pack("<Q", 0)
     )
-    cameras = [struct.pack("<IiQQ4d", number, 1, 4, 4, number, 1, 2, 2) for number in (1, 2)]
+    cameras = [struct.pack("<IiQQ4d", number, 1, 4, 4, 10 * number, 10, 2, 2) for number in (1, 2)]
     (tmp_path / "cameras.bin").write_bytes(struct.pack("<Q", 2) + b"".join(cameras))
-    assert params_of(read_poses(tmp_path), Camera.pinhole(2, 1, 1.5, 1.5, size=(4, 4))) == [2, 1, 1.5, 1.5]
+    assert params_of(read_poses(tmp_path), Camera.pinhole(20, 10, 1.5, 1.5, size=(4, 4))) == [
+        20,
+        10,
+        1.5,
+        1.5,
+    ]
     (tmp_path / "cameras.bin").write_bytes(struct.pack("<Q", 1) + cameras[0])
     with pytest.raises(CalibrationError, match="no camera 2"):
         read_poses(tmp_path)

@@ -398,32 +398,28 @@ def _from_transforms(keys: Keys) -> Calibration:
     Its pixels count from the corner of the top left one.
     """
     source, frames = keys.source, keys.value("frames") if ("frames",) in keys else ()
-    cameras: dict[str, dict[str, Any]] = {}  # the frame that has it first
-    shared = {key: keys.value(normal(key)) for key in OF_FRAMES if (normal(key),) in keys}
-    for frame in frames if isinstance(frames, list) else ():
-        own = {key: frame[key] for key in OF_FRAMES if key in frame} if isinstance(frame, dict) else {}
-        other = next((key for key in own.keys() & shared.keys() if own[key] != shared[key]), None)
-        if other is not None:
-            raise CalibrationError(
-                f"{source}: frame {str(frame.get('file_path', ''))[:80]} has a {other} of its own, {own[other]}, where "
-                f"{shared[other]} is for all frames; give the images of one camera, or --camera for all"
-            )
-        whole = {key: value for key, value in (shared | own).items() if value}
-        if whole not in cameras.values():
-            cameras[str(frame.get("file_path", ""))[:80] if isinstance(frame, dict) else ""] = whole
-        if len(cameras) > 1:
-            (one, first), (other, second) = list(cameras.items())[:2]
-            key = next(key for key in OF_FRAMES if first.get(key) != second.get(key))
-            raise CalibrationError(
-                f"{source}: the frames have different cameras: {key} is {first.get(key, 'missing')} of {one}, "
-                f"{second.get(key, 'missing')} of {other}; give the images of one camera, or --camera for all"
-            )
+    shared = {key: keys.value(normal(key)) or None for key in OF_FRAMES if (normal(key),) in keys}
+    cameras: dict[str, dict[str, Any]] = {}  # the first one, by the frame that has it
+    for frame in (each for each in frames if isinstance(each, dict)) if isinstance(frames, list) else ():
+        own = {key: frame[key] or None for key in OF_FRAMES if key in frame}
+        both, name = shared | own, str(frame.get("file_path", ""))[:80]
+        for other, camera in {"all frames": own | shared, **cameras}.items():
+            if (
+                key := next((key for key in OF_FRAMES if camera.get(key) != both.get(key)), None)
+            ) is not None:
+                raise CalibrationError(
+                    f"{source}: the frames have different cameras: {key} is {camera.get(key) or 'missing'} of {other}, "
+                    f"{both.get(key) or 'missing'} of {name}; give the images of one camera, or --camera for all"
+                )
+        cameras = cameras or {name: both}
     if cameras:
-        keys = keys.with_values(dict.fromkeys(shared) | next(iter(cameras.values())))
+        keys = keys.with_values(next(iter(cameras.values())))
     size = _size(keys, ("",))
     focal, angle = keys.number("flx"), keys.number("cameraanglex")
     if focal is None and size is not None and angle is not None:
-        focal = 0.5 * size[0] / math.tan(0.5 * angle) if angle > 0 else 0.0
+        if not 0 < angle < math.pi:
+            raise CalibrationError(f"{source}: camera_angle_x is {angle:g}, no angle of an image in radians")
+        focal = 0.5 * size[0] / math.tan(0.5 * angle)
     if focal is None:
         raise CalibrationError(f"{source}: no fl_x in it that holds for all frames, nor w and camera_angle_x")
     intrinsics = [focal, keys.number("fly") or focal]

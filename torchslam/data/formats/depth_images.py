@@ -20,7 +20,7 @@ import numpy as np
 from jaxtyping import Float, Shaped
 from torch import Tensor
 
-from torchslam.data.formats.frame_names import MAX_FILES, in_order, times_in_names
+from torchslam.data.formats.frame_names import MAX_FILES, files_in, in_order, times_in_names
 from torchslam.data.formats.image_file import AS_STORED, MAX_BYTES, MAX_PIXELS, read_pixels
 from torchslam.data.text_file import check_rising, float64, listed_files, parse_number
 from torchslam.errors import FrameError, MeasurementError, SequenceError
@@ -105,13 +105,9 @@ def find_depth_images(path: str | Path, units_per_meter: float | None = None) ->
 
 def _files(folder: Path) -> list[Path]:
     """The depth images in a folder: those of 7-Scenes are beside the color images."""
-    entries = list(itertools.islice(folder.iterdir(), MAX_FILES + 1))
-    if len(entries) > MAX_FILES:
-        raise MeasurementError(f"{folder}: more than {MAX_FILES} files")
-    found = [file for file in entries if file.suffix.lower() in SUFFIXES and not file.name.startswith(".")]
-    beside = [file for file in found if file.match(SEVEN_SCENES_DEPTH)]
     try:
-        return in_order(beside or found)
+        found = [file for file in files_in(folder, SUFFIXES) if not file.name.startswith(".")]
+        return in_order([file for file in found if file.match(SEVEN_SCENES_DEPTH)] or found)
     except SequenceError as error:
         raise MeasurementError(str(error)) from None
 

@@ -7,7 +7,7 @@ import itertools
 import re
 import statistics
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Iterable, Set
 from functools import partial
 from pathlib import Path
 from typing import NamedTuple
@@ -156,7 +156,7 @@ def find_frames(folder: Path, pattern: str = "*") -> Found:
     """
     frames: list[Path] = []
     left_out: Counter[str] = Counter()
-    for file in _files(folder):
+    for file in files_in(folder, SUFFIXES | FOREIGN):
         kind = other_kind(file)
         if not fnmatch.fnmatchcase(file.name, pattern):
             continue
@@ -224,17 +224,17 @@ def subfolder(folder: Path) -> Path | None:
     """The folder inside another one that has frames by its name and content: `images/`, `rgb/` and the like."""
     for name in FOLDERS:
         inner = folder / name
-        if inner.is_dir() and any(other_kind(file) is None for file in _files(inner)):
+        if inner.is_dir() and any(other_kind(file) is None for file in files_in(inner, SUFFIXES | FOREIGN)):
             return inner
     return None
 
 
-def _files(folder: Path) -> list[Path]:
-    """The files of a folder with an image's suffix, also one that is not read."""
+def files_in(folder: Path, suffixes: Set[str]) -> list[Path]:
+    """The files of a folder with one of some suffixes. Raises SequenceError for more than MAX_FILES entries."""
     entries = list(itertools.islice(folder.iterdir(), MAX_FILES + 1))
     if len(entries) > MAX_FILES:
         raise SequenceError(f"{folder}: more than {MAX_FILES} files; give a folder with the images alone")
-    return [file for file in entries if file.suffix.lower() in SUFFIXES | FOREIGN and file.is_file()]
+    return [file for file in entries if file.suffix.lower() in suffixes and file.is_file()]
 
 
 def is_pattern(path: str) -> bool:

@@ -230,7 +230,11 @@ def _read_transforms(path: Path, with_camera: bool) -> GivenPoses:
     if T_wc.shape[1:] not in ((4, 4), (3, 4)):
         raise TrajectoryError(f"{path}: no frames with a transform_matrix of 4 x 4 numbers")
     places = [f"{path}: frame {name[:80]}" for name, _ in frames]
-    T_wc = checked_poses(rigid(T_wc[:, :3, :3], T_wc[:, :3, 3]), places)
+    checked_poses(T_wc, places)
+    last = T_wc.new_tensor((0.0, 0.0, 0.0, 1.0))
+    for row in torch.nonzero((T_wc[:, 3:] != last).any(-1).any(-1))[:1, 0].tolist():
+        hint = ": it is transposed" if bool((T_wc[row, :, 3] == last).all()) else ""
+        raise TrajectoryError(f"{places[row]}: the last row of transform_matrix is not 0 0 0 1{hint}")
     T_cw = se3_inverse(opengl(rigid(nearest_rotation(T_wc[:, :3, :3]), T_wc[:, :3, 3])))
     # Else the sequence or the user must know it.
     has_camera = "fl_x" in content or "camera_angle_x" in content or has_cameras(content["frames"])
