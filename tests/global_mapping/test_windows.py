@@ -2,35 +2,39 @@
 
 from __future__ import annotations
 
+import sys
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
+from typing import Self
 
 import pytest
 import torch
 from torch import Tensor
 
 from tests.global_mapping.synthetic import CAMERA, Recording, apart, line, wall
+from tests.parallel.test_pool import wait_until_ready
 from tests.walks import Walk
 from tests.walks import arc as walk_arc
 from torchslam.config import load_config
 from torchslam.geometry import se3_inverse, so3_exp, transform
 from torchslam.geometry.transforms import without_scale
-from torchslam.global_mapping.mapper import GlobalMapper
+from torchslam.global_mapping.coarse import CoarseMap, CoarseMapper
+from torchslam.global_mapping.mapper import GlobalMapper, Reconstructed
 from torchslam.global_mapping.rounds import Reconstruction
 from torchslam.global_mapping.saved_stages import SavedStages
 from torchslam.global_mapping.view_graph import ViewPair
 from torchslam.global_mapping.windows import (
     MIN_HOLDING,
     MIN_JOINING,
-    CoarseMap,
     MappedWindow,
     join_windows,
-    pairs_across,
+    pairs_kept,
     pairs_that_hold,
     pairs_within,
     split,
 )
+from torchslam.parallel.pool import Call, SharedTasks
 from torchslam.types import FrameFeatures
 
 SCENE = Recording.of(line(40), wall(900, 10.0), noise_px=0.3)
@@ -154,30 +158,33 @@ def test_a_window_is_cut_where_few_points_hold_it(crossing: int, parts: int) -> 
 
 
 def test_pairs_of_windows() -> None:
-    """Those within have the rows of their window; of the others none has both images."""
+    """Those within have the rows of their window; those of which no window has both images are always kept."""
     pairs = SCENE.pairs(1, 12)
     windows = split(40, 15)
     within = [pairs_within(pairs, window) for window in windows]
     assert all(0 <= pair.first < pair.second < 15 for of_window in within for pair in of_window)
-    across = pairs_across(pairs, windows)
-    ends = {(pair.first, pair.second) for pair in across}
     inside = {
         (pair.first + window.start, pair.second + window.start)
         for of_window, window in zip(within, windows, strict=True)
         for pair in of_window
     }
-    assert not ends & inside
-    assert ends | inside == {(pair.first, pair.second) for pair in pairs}
+    across = {(pair.first, pair.second) for pair in pairs_kept(pairs, windows, [])}
+    assert across
+    assert not across & inside
+    assert across | inside == {(pair.first, pair.second) for pair in pairs}
+    some = frozenset(sorted(inside)[::2])
+    kept = {(pair.first, pair.second) for pair in pairs_kept(pairs, windows, [some, frozenset()])}
+    assert kept == across | some
 
 
 def test_pairs_that_poses_contradict_are_left_out() -> None:
     pairs = SCENE.pairs(1)
     T_21 = pairs[3].T_21.clone()
     T_21[:3, :3] = so3_exp(torch.tensor([0.11, 0.0, 0.0], dtype=torch.float64)) @ T_21[:3, :3]
-    given = [*pairs, replace(pairs[3], T_21=T_21), *pairs[:2]]
+    pairs[3] = replace(pairs[3], T_21=T_21)
     known = torch.ones(40, dtype=torch.bool)
     known[20] = False
-    held = pairs_that_hold(given, SCENE.T_cw, known)
+    held = pairs_that_hold(pairs, SCENE.T_cw, known)
     assert [(pair.first, pair.second) for pair in held] == [
         (row, row + 1) for row in range(39) if row not in (3, 19, 20)
     ]
@@ -193,9 +200,14 @@ def mapper(size: int) -> GlobalMapper:
 
 
 def reconstructed(size: int, pairs: list[ViewPair]) -> tuple[list[int], Tensor]:
-    found = mapper(size).reconstruct(SCENE.views, pairs)
+    rows, _, found = reconstructed_by(mapper(size), pairs)
+    return rows.tolist(), found.T_cw
+
+
+def reconstructed_by(made: GlobalMapper, pairs: list[ViewPair] | None = None) -> Reconstructed:
+    found = made.reconstruct(SCENE.views, pairs or SCENE.pairs(1, 2, 3))
     assert not isinstance(found, str)
-    return found[0].tolist(), found[2].T_cw
+    return found
 
 
 def test_a_map_in_windows_is_the_map_of_the_whole() -> None:
@@ -219,13 +231,13 @@ def test_an_image_that_only_other_windows_see_has_a_pose() -> None:
 
 
 def test_a_run_that_was_killed_goes_on_at_its_window(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    pairs, begun, begin = SCENE.pairs(1, 2, 3), list[int](), GlobalMapper._begin
+    pairs, begun, begin = SCENE.pairs(1, 2, 3), list[int](), CoarseMapper.map
 
-    def counted(self: GlobalMapper, views: list[FrameFeatures], *pairs: list[ViewPair]) -> CoarseMap | str:
+    def counted(self: CoarseMapper, views: list[FrameFeatures], *pairs: list[ViewPair]) -> CoarseMap | str:
         begun.append(views[0].index)
         return begin(self, views, *pairs)
 
-    monkeypatch.setattr(GlobalMapper, "_begin", counted)
+    monkeypatch.setattr(CoarseMapper, "map", counted)
 
     def found(folder: Path | None, stop: int = -1) -> list[Tensor]:
         def progress(stage: str, done: int, most: int) -> None:
@@ -245,6 +257,40 @@ def test_a_run_that_was_killed_goes_on_at_its_window(tmp_path: Path, monkeypatch
         found(tmp_path / "stages", 2)
     assert all(map(torch.equal, found(tmp_path / "stages"), whole))
     assert begun == windows[2:]
+
+
+def test_windows_in_two_processes_give_the_same_bytes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A worker saves its windows as well, so that a run that is ended can go on."""
+    elsewhere = list[object]()
+
+    class Counted(SharedTasks):
+        def __enter__(self) -> Self:
+            super().__enter__()
+            if self.count:
+                wait_until_ready(self)
+            return self
+
+        def result(self, call: Call) -> object:
+            elsewhere.append(call)
+            return super().result(call)
+
+    monkeypatch.setattr("torchslam.parallel.pool.can_fork", lambda: sys.platform == "linux")
+    monkeypatch.setattr("torchslam.global_mapping.mapper.SharedTasks", Counted)
+    found = list[list[bytes]]()
+    for processes in (1, 2):
+        made = mapper(15)
+        made.processes = processes
+        made.saved = SavedStages(tmp_path / str(processes), made.sequence, made.config)
+        rows, observed, whole = reconstructed_by(made)
+        tensors = rows, observed.tracks.keypoint, whole.T_cw, whole.points_w, whole.camera.params
+        found.append([tensor.numpy().tobytes() for tensor in tensors])
+    assert found[0] == found[1]
+    assert elsewhere
+    one, two = ({path.name: path.read_bytes() for path in (tmp_path / each).iterdir()} for each in ("1", "2"))
+    assert one == two
+    assert len(one) == len(split(40, 15))
 
 
 def test_without_a_map_of_any_window_the_first_reason_is_given() -> None:

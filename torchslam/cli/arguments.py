@@ -274,8 +274,9 @@ def add_processes(parser: argparse._ActionsContainer) -> None:
         "--processes",
         type=at_least(1),
         metavar="N",
-        help="number of processes: 2 adds a feature prefetcher, 3 also a bundle-adjustment worker; results are "
-        "identical (default: 3 if two processors are free and there are enough frames, else 1)",
+        help="number of processes: 2 adds a feature prefetcher, 3 also a bundle-adjustment worker; windows of a long "
+        "recording are mapped in as many; results are identical (default: 3 if two processors are free and there are "
+        "enough frames, else 1; for windows one per free processor)",
     )
 
 

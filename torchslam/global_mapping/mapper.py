@@ -7,7 +7,7 @@ from collections.abc import Callable, Collection, Iterable, Iterator
 from collections.abc import Sequence as Rows
 from dataclasses import dataclass, replace
 from functools import partial
-from itertools import compress, pairwise
+from itertools import pairwise
 from statistics import median
 
 import torch
@@ -17,11 +17,11 @@ from torch import Tensor
 from torchslam.config import Config
 from torchslam.data.sequence import Sequence
 from torchslam.errors import ConfigError, FrameError
-from torchslam.geometry import Camera, SensorModel, rigid
+from torchslam.geometry import Camera, SensorModel
 from torchslam.geometry.camera_measurement import CameraMeasurement
 from torchslam.geometry.rolling_shutter import Readout
-from torchslam.global_mapping.baselines import chained_positions
 from torchslam.global_mapping.check import MapCheck, check_map
+from torchslam.global_mapping.coarse import CoarseMap, CoarseMapper
 from torchslam.global_mapping.frames_between import FollowedViews, pose_frames
 from torchslam.global_mapping.links import (
     MIN_LEARNED_MATCHES,
@@ -37,35 +37,25 @@ from torchslam.global_mapping.rounds import (
     MIN_VIEWS,
     ObservedTracks,
     Reconstruction,
-    adjust_coarsely,
     adjust_in_rounds,
 )
 from torchslam.global_mapping.saved_stages import SavedStages
 from torchslam.global_mapping.tracks import keypoints_of_tracks, make_map
-from torchslam.global_mapping.view_graph import (
-    PairMatcher,
-    Relation,
-    ViewPair,
-    build_view_graph,
-    connected_views,
-)
+from torchslam.global_mapping.view_graph import PairMatcher, ViewPair, build_view_graph
 from torchslam.global_mapping.windows import (
-    CoarseMap,
     MappedWindow,
     join_windows,
-    moved_pairs,
-    pairs_across,
+    pairs_kept,
     pairs_that_hold,
     pairs_within,
-    rotations_hold,
     split,
 )
 from torchslam.map.atlas import Atlas
 from torchslam.map.map import Map
 from torchslam.mapping.local_bundle import squared_errors
-from torchslam.optim import ROTATION_OPTIONS
 from torchslam.optim.model_choice import predictive_gain
-from torchslam.optim.rotation_averaging import solve_rotations
+from torchslam.parallel.pool import SharedTasks
+from torchslam.parallel.workers import busy_elsewhere, processors
 from torchslam.system.final_adjustment import FinalAdjustment
 from torchslam.system.front_end import (
     Extractor,
@@ -81,12 +71,6 @@ from torchslam.types import Explanation, Frame, FrameFeatures, Reason, State, St
 
 SIFT_RATIO, SIFT_DISTANCE = 0.64, 0.245
 """Ratio test and largest distance of SIFT's descriptors, as 1 - cosine: COLMAP's 0.8 and 0.7 between unit vectors."""
-ROTATION_STD_RAD = 0.01
-"""Standard deviation of the rotation of a pair with the mean number of matches: 0.15 to 0.3 degrees in the median on
-real recordings, with a long tail. Tried 0.005 to 0.02."""
-MIN_GENERAL = 0.2
-"""Least share of pairs that determine a direction of motion: a camera that only turns has none, or, with a wrong focal
-length, a few; walks have 0.8 and more."""
 HELD_BACK = 10
 """One in this many verified pairs is held out from mapping, for the check of the map."""
 HELD_BACK_DISTANCE = 2
@@ -210,6 +194,7 @@ class GlobalMapper:
         progress: receives stages.
         saved: the costly stages of a run that was ended, and of this one; None: they are not saved.
         kept: features that were extracted before, by `features_to_keep`; None: there are none.
+        processes: number of processes, this one included; None: the best number. The result is the same.
     """
 
     def __init__(
@@ -223,6 +208,7 @@ class GlobalMapper:
         progress: Progress = lambda stage, done, most: None,
         saved: SavedStages | None = None,
         kept: KeptFeatures | None = None,
+        processes: int | None = 1,
     ) -> None:
         self.camera = camera.to(device).to(torch.float64)
         self.config = mapping_config(config)
@@ -234,6 +220,7 @@ class GlobalMapper:
         self.matcher = make_matcher(self.config.matching, None, camera.size, self.config.features.kind)
         self.progress = progress
         self.saved = saved or SavedStages(None, self.sequence, config)
+        self.processes = processes
         self.skipped: list[str] = []
         self.readout: Readout | None = None  # by which the keypoints of images are corrected
 
@@ -325,10 +312,11 @@ class GlobalMapper:
         if learned is not None:
             views, more = learned
         windows = split(len(views), self.config.global_mapping.window_images)
+        coarse = CoarseMapper(self.camera, self.given, self.progress)
         begun = (
-            self._begin(views, pairs, more)
+            coarse.map(views, pairs, more)
             if len(windows) == 1
-            else self._begin_in_windows(windows, views, pairs, more)
+            else self._map_in_windows(coarse, windows, views, pairs, more)
         )
         if isinstance(begun, str):
             return begun
@@ -342,91 +330,52 @@ class GlobalMapper:
             return f"no map: {len(views)} images agree on no points; the camera may only turn"
         return seen, observed, found
 
-    def _begin(
-        self, views: list[FrameFeatures], pairs: list[ViewPair], learned: list[ViewPair]
-    ) -> CoarseMap | str:
-        """Rotations, positions and coarse adjustment of views that are mapped together."""
-        self.progress("rotations", 0, 1)
-        own, pairs = len(pairs), pairs + learned
-        if not pairs:
-            return f"no map: no two of {len(views)} images show the same scene"
-        edges = torch.tensor([(pair.first, pair.second) for pair in pairs], device=self.camera.params.device)
-        R_21 = torch.stack([pair.T_21[:3, :3] for pair in pairs])
-        weights = R_21.new_tensor([float(len(pair)) for pair in pairs])
-        weights = weights / weights.mean() / ROTATION_STD_RAD**2
-        average = solve_rotations(
-            edges, R_21, len(views), weights, options=ROTATION_OPTIONS.replace(backward="detached")
-        )
-        held = rotations_hold(pairs, average.R_cw)
-        own = sum(held[:own])
-        pairs = list(compress(pairs, held))
-        others = sum(pair.relation is not Relation.GENERAL for pair in pairs)
-        if len(pairs) - others < MIN_GENERAL * len(pairs):
-            about = f"{others} of {len(pairs)} pairs of images"
-            return f"no map: the camera stands still, only turns, or sees a plane in {about}"
-        connected = set(connected_views(pairs, len(views)).tolist())
-        own = sum(pair.first in connected for pair in pairs[:own])
-        pairs = [pair for pair in pairs if pair.first in connected]
-        self.progress("positions", 0, 1)
-        camera = self.camera if self.given is None else self.given.camera
-        centers_w = chained_positions(pairs, average.R_cw, views, self.camera)
-        T_cw = rigid(average.R_cw, -(average.R_cw @ centers_w[..., None])[..., 0])
-        return self._adjusted(views, pairs[:own], pairs[own:], T_cw, camera, [])
-
-    def _begin_in_windows(
+    def _map_in_windows(
         self,
+        coarse: CoarseMapper,
         windows: list[range],
         views: list[FrameFeatures],
         pairs: list[ViewPair],
         learned: list[ViewPair],
     ) -> CoarseMap | str:
-        """Map windows of views, and give them a common world."""
-        mapped, own, more, failure = list[MappedWindow](), list[ViewPair](), list[ViewPair](), ""
-        for number, window in enumerate(windows):
-            self.progress("windows", number, len(windows))
-            part = self.saved.window(
-                views[window.start : window.stop],
+        """Map windows of views, each in one of the processes, and give them a common world."""
+        slim = [replace(view, descriptors=view.descriptors[:, :0]) for view in views]
+        tasks = [
+            (
+                window,
+                slim[window.start : window.stop],
                 pairs_within(pairs, window),
                 pairs_within(learned, window),
-                self.camera,
-                self._begin,
             )
-            if isinstance(part, str):
-                failure = failure or part
-                continue
-            mapped.append(MappedWindow(part.observed, part.found, window.start))
-            own += moved_pairs(part.pairs, window.start)
-            more += moved_pairs(part.learned, window.start)
+            for window in windows
+        ]
+        parts = self.saved, CoarseMapper(self.camera, self.given)
+        found = dict[int, MappedWindow | str]()
+        with SharedTasks(map_window, parts, min(self._processes(), len(windows)), ahead=1) as shared:
+            self.progress("windows", 0, len(windows))
+            for number, made in shared.run(tasks):
+                found[number] = made
+                self.progress("windows", len(found), len(windows))
+        ordered = [found[number] for number in range(len(windows))]
+        mapped = [made for made in ordered if isinstance(made, MappedWindow)]
         if not mapped:
-            return failure
+            return next(made for made in ordered if isinstance(made, str))
         self.progress("joining", 0, 1)
         T_cw, known = join_windows(mapped, pairs + learned, views)
         own, more = (
-            pairs_that_hold(held + pairs_across(found, windows), T_cw, known)
-            for held, found in ((own, pairs), (more, learned))
+            pairs_that_hold(pairs_kept(every, windows, (made.kept[at] for made in mapped)), T_cw, known)
+            for at, every in enumerate((pairs, learned))
         )
         camera = max(mapped, key=lambda part: int(part.found.agrees.sum())).found.camera
         posed = set(known.nonzero()[:, 0].tolist())
         unposed = [pair for pair in pairs + learned if not {pair.first, pair.second} <= posed]
-        return self._adjusted(views, own, more, T_cw, camera, unposed)
+        return coarse.adjust(views, own, more, T_cw, camera, unposed)
 
-    def _adjusted(
-        self,
-        views: list[FrameFeatures],
-        pairs: list[ViewPair],
-        learned: list[ViewPair],
-        T_cw: Float[Tensor, "K 4 4"],
-        camera: Camera,
-        unposed: list[ViewPair],
-    ) -> CoarseMap | str:
-        """Adjust approximate poses coarsely."""
-        observed = ObservedTracks.join(pairs + learned, views)
-        if observed.tracks.count == 0:
-            return f"no map: no point is seen by {MIN_VIEWS} of {len(views)} images"
-        self.progress("adjustment", 0, 1)
-        observed = observed.longest()
-        found = adjust_coarsely(observed, T_cw, self.given, camera, self._log)
-        return CoarseMap(pairs, learned, observed, found, unposed)
+    def _processes(self) -> int:
+        """The number of processes that map windows, this one included."""
+        if self.camera.params.device.type != "cpu":
+            return 1
+        return self.processes or max(1, processors() - busy_elsewhere())
 
     def _log(self, words: str) -> None:
         self.progress(words, 0, 1)
@@ -579,6 +528,25 @@ class GlobalMapper:
         ]
         run = Run((), SensorModel(self.camera), self.config, results, self.skipped, False, reason)
         return GlobalMap(run, views, pairs, frozenset())
+
+
+def map_window(
+    saved: SavedStages,
+    coarse: CoarseMapper,
+    window: range,
+    views: list[FrameFeatures],
+    pairs: list[ViewPair],
+    learned: list[ViewPair],
+) -> MappedWindow | str:
+    """Map a window of images, or read the map that an earlier run saved; the reason where there is none."""
+    made = saved.window(views, pairs, learned, coarse.camera, coarse.map)
+    if isinstance(made, str):
+        return made
+    kept = tuple(
+        frozenset((pair.first + window.start, pair.second + window.start) for pair in every)
+        for every in (made.pairs, made.learned)
+    )
+    return MappedWindow(made.observed, made.found, window.start, kept)
 
 
 def choose_held_back(pairs: list[ViewPair]) -> frozenset[int]:

@@ -172,7 +172,17 @@ def _mapped(
         with observer.whole():
             camera = sequence.camera
             return map_recording(
-                sequence, run, config, camera, mapping, device, observer.stage, stages, go_on, features
+                sequence,
+                run,
+                config,
+                camera,
+                mapping,
+                device,
+                observer.stage,
+                stages,
+                go_on,
+                features,
+                online.processes,
             )
     except KeyboardInterrupt:
         return replace(MappedRun.of(online.end()), interrupted=True)
@@ -207,6 +217,7 @@ def map_recording(
     stages: Path | None = None,
     go_on: Callable[[], Run] | None = None,
     features: KeptFeatures | None = None,
+    processes: int | None = 1,
 ) -> MappedRun:
     """Check an online run, and map its recording as a whole where that is wanted or needed.
 
@@ -223,6 +234,7 @@ def map_recording(
         go_on: processes the other frames and returns the finished run, where `online` stopped; None: it is finished.
             It is called only where the map of the whole is not right: no run that was lost is better than a right one.
         features: those that were extracted before, by `features_to_keep`; None: there are none.
+        processes: number of processes, this one included; None: the best number. The result is the same.
     """
     check, camera = None, camera.to(device)
     why = _loss(online) if go_on is None else f"tracking was lost at frame {online.results[-1].index}"
@@ -236,7 +248,15 @@ def map_recording(
     given = CameraMeasurement.of(camera.to(torch.float64), config.camera.std) if config.camera.std else None
     saved = SavedStages(stages, sequence, config, device)
     mapper = GlobalMapper(
-        sequence, camera, config, given, device, progress=progress, saved=saved, kept=features
+        sequence,
+        camera,
+        config,
+        given,
+        device,
+        progress=progress,
+        saved=saved,
+        kept=features,
+        processes=processes,
     )
     made = mapper.run(online.results, online)
     reduction = mapper.config.features.reduction(camera.size)

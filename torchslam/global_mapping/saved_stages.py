@@ -21,10 +21,10 @@ from torchslam.config import Config
 from torchslam.data.sequence import Sequence as Recording
 from torchslam.errors import ResultsError
 from torchslam.geometry import Camera
+from torchslam.global_mapping.coarse import CoarseMap
 from torchslam.global_mapping.rounds import ObservedTracks, Reconstruction
 from torchslam.global_mapping.tracks import Tracks
 from torchslam.global_mapping.view_graph import PairMatcher, Relation, ViewPair
-from torchslam.global_mapping.windows import CoarseMap
 from torchslam.map.file import FORMAT, read_tensors, write_tensors
 from torchslam.system.checkpoint import input_hash
 from torchslam.types import FrameFeatures

@@ -9,7 +9,7 @@ Davison, "Scale drift-aware large scale monocular SLAM", 2010, with maps in plac
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from itertools import compress
 from typing import NamedTuple
@@ -48,22 +48,6 @@ JOINT_STD = 0.01
 Those of windows of garden with 50 images differ by .0004 rad, .003 and .005."""
 
 
-class CoarseMap(NamedTuple):
-    """Poses that are right to about a pixel.
-
-    Attributes:
-        pairs: that the map is from; learned: those of learned features; unposed: those with images without a pose.
-        observed: the longest tracks.
-        found: poses of all views, camera and the points of these tracks.
-    """
-
-    pairs: list[ViewPair]
-    learned: list[ViewPair]
-    observed: ObservedTracks
-    found: Reconstruction
-    unposed: list[ViewPair]
-
-
 class MappedWindow(NamedTuple):
     """The map of a window.
 
@@ -71,11 +55,13 @@ class MappedWindow(NamedTuple):
         observed: tracks in its images.
         found: poses of these images, camera, points and the observations that agree.
         first: row of its first image among all of the recording.
+        kept: images, among all, of the pairs that the map is from, and of those of learned features.
     """
 
     observed: ObservedTracks
     found: Reconstruction
     first: int
+    kept: tuple[frozenset[tuple[int, int]], ...] = ()
 
     def parts(self) -> list[MappedWindow]:
         """The parts that enough points hold together: where they are few, each side may have a scale of its own."""
@@ -107,11 +93,6 @@ def pairs_within(pairs: Sequence[ViewPair], window: range) -> list[ViewPair]:
     ]
 
 
-def moved_pairs(pairs: Sequence[ViewPair], by: int) -> list[ViewPair]:
-    """Pairs with the rows of their images moved."""
-    return [replace(pair, first=pair.first + by, second=pair.second + by) for pair in pairs]
-
-
 def rotations_hold(pairs: Sequence[ViewPair], R_cw: Float[Tensor, "K 3 3"]) -> list[bool]:
     """Which pairs have the relative rotations of images."""
     if not pairs:
@@ -122,20 +103,25 @@ def rotations_hold(pairs: Sequence[ViewPair], R_cw: Float[Tensor, "K 3 3"]) -> l
     return (off < MAX_ROTATION_ERROR_RAD).tolist()
 
 
-def pairs_across(pairs: Sequence[ViewPair], windows: Sequence[range]) -> list[ViewPair]:
-    """The pairs of which no window has both images."""
-    return [pair for pair in pairs if not any(pair.first in each and pair.second in each for each in windows)]
+def pairs_kept(
+    pairs: Sequence[ViewPair], windows: Sequence[range], kept: Iterable[frozenset[tuple[int, int]]]
+) -> list[ViewPair]:
+    """The pairs that the map of some window is from, and those of which no window has both images."""
+    held = frozenset[tuple[int, int]]().union(*kept)
+    return [
+        pair
+        for pair in pairs
+        if (pair.first, pair.second) in held
+        or not any(pair.first in each and pair.second in each for each in windows)
+    ]
 
 
 def pairs_that_hold(
     pairs: Sequence[ViewPair], T_cw: Float[Tensor, "K 4 4"], known: Bool[Tensor, " K"]
 ) -> list[ViewPair]:
-    """Each pair once that poses of images agree with, in order; `known`: which images have one."""
-    chosen = {
-        (pair.first, pair.second): pair for pair in pairs if bool(known[[pair.first, pair.second]].all())
-    }
-    ordered = [chosen[ends] for ends in sorted(chosen)]
-    return list(compress(ordered, rotations_hold(ordered, T_cw[:, :3, :3])))
+    """The pairs that poses of images agree with; `known`: which images have one."""
+    told = [pair for pair in pairs if bool(known[[pair.first, pair.second]].all())]
+    return list(compress(told, rotations_hold(told, T_cw[:, :3, :3])))
 
 
 def join_windows(

@@ -39,7 +39,7 @@ from torchslam.utils.forks import close_decoders
 RESPONSE_TIMEOUT_S = 60.0
 """A worker that was stopped is given up after this time; a frame or a local adjustment takes less than a second."""
 AHEAD = 2
-"""Tasks that each worker is sent at a time, so that it need not wait while this process does one of its own."""
+"""Short tasks that each worker is sent at a time, so that it need not wait while this process does one of its own."""
 
 
 class WorkerLostError(Exception):
@@ -231,35 +231,37 @@ class SharedTasks(WorkerPool):
     """Workers that help this process with tasks while this is entered; what a killed one left undone is done here.
 
     Args:
-        do: (*parts, *task) -> None does a task; a function of a module, since workers import it.
+        do: (*parts, *task) does a task; a function of a module, since workers import it.
         parts: what all tasks have in common.
         processes: number of processes, this one included.
+        ahead: tasks that each worker is sent at a time; 1 where tasks are few and long.
     """
 
-    def __init__(self, do: Callable[..., None], parts: tuple[Any, ...], processes: int) -> None:
+    def __init__(
+        self, do: Callable[..., Any], parts: tuple[Any, ...], processes: int, ahead: int = AHEAD
+    ) -> None:
         super().__init__(processes - 1, partial, do, *parts)
-        self._do = partial(do, *parts)
+        self._do, self._ahead = partial(do, *parts), ahead
 
-    def run(self, tasks: Sequence[tuple[Any, ...]]) -> Iterator[None]:
-        """Do all tasks; yields once after each.
+    def run(self, tasks: Sequence[tuple[Any, ...]]) -> Iterator[tuple[int, Any]]:
+        """Do all tasks; yields the number of each with its result, in the order in which they end.
 
         Raises what a task raises, here or in a worker.
         """
-        waiting, calls = deque(tasks), list[tuple[Call, tuple[Any, ...]]]()
+        waiting, calls = deque(enumerate(tasks)), list[tuple[Call, int]]()
         while waiting or calls:
-            while waiting and len(calls) < AHEAD * self.count:
-                call = self.submit(*waiting[0])
+            while waiting and len(calls) < self._ahead * self.count:
+                call = self.submit(*waiting[0][1])
                 if call is None:
                     break
-                calls.append((call, waiting.popleft()))
+                calls.append((call, waiting.popleft()[0]))
             if waiting:
-                self._do(*waiting.popleft())
-                yield
+                number, task = waiting.popleft()
+                yield number, self._do(*task)
             asked, timeout = (calls, 0) if waiting else (calls[:1], None)
             for each in [each for each in asked if self.has_answer(each[0], timeout)]:
                 calls.remove(each)
-                self.result_or(each[0], partial(self._do, *each[1]))
-                yield
+                yield each[1], self.result_or(each[0], partial(self._do, *tasks[each[1]]))
 
 
 def can_fork() -> bool:
