@@ -77,7 +77,9 @@ def test_a_zoom_is_found(ratio: Callable[[Tensor], Tensor]) -> None:
     expected = ratio(estimate.zoom.frames.double())
     assert float((estimate.zoom.ratios / expected).log().abs().max()) < 0.01
     assert float(estimate.zoom.ratios[0]) == 1.0
-    assert abs(float(estimate.camera.focal) / float(CAMERA.focal) - 1) < 0.03  # for the final adjustment to settle
+    assert (
+        abs(float(estimate.camera.focal) / float(CAMERA.focal) - 1) < 0.03
+    )  # for the final adjustment to settle
 
 
 def test_a_jump_between_keyframes_is_placed() -> None:

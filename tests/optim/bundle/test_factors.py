@@ -355,7 +355,8 @@ def of_all_kinds(scene):
 
 @pytest.mark.parametrize("frames", [5, 40])
 def test_factors_of_all_kinds_have_their_minimum_and_gradient(bundle_scene, frames):
-    """The gradient of the written-out cost vanishes, and agrees with differences; nothing is fixed."""
+    """The gradient of the written-out cost vanishes, and agrees with differences; nothing is fixed. In one
+    direction of a few tensors at a time; with many frames, of all."""
     scene = bundle_scene(noise=1.0, frames=frames, points=30, fixed_frames=())
     factors, tensors = of_all_kinds(scene)
     focal = torch.tensor([[1.0], [1.0], [0.0], [0.0]]).double()
@@ -373,14 +374,21 @@ def test_factors_of_all_kinds_have_their_minimum_and_gradient(bundle_scene, fram
         + solution.camera.params[0]
     )
     gradients = torch.autograd.grad(loss, list(leaves.values()))
-    for name, gradient in zip(tensors, gradients, strict=True):
-        step = 1e-4 * draw(*gradient.shape, seed=11)
-        step = step + step.mT if name == "T_information" else step
+    slopes = dict(zip(tensors, gradients, strict=True))
+    groups = 3 if frames < 10 else 1
+    for names in (list(tensors)[group::groups] for group in range(groups)):
+        steps = {name: 1e-4 * draw(*slopes[name].shape, seed=11) for name in names}
+        if "T_information" in steps:
+            steps["T_information"] = steps["T_information"] + steps["T_information"].mT
         with torch.no_grad():
-            up, down = (solved(tensors | {name: tensors[name] + sign * step}) for sign in (1, -1))
+            up, down = (
+                solved(tensors | {name: tensors[name] + sign * step for name, step in steps.items()})
+                for sign in (1, -1)
+            )
         moved = weights[0] * (up.T_cw - down.T_cw), weights[1] * (up.points_w - down.points_w)
         difference = moved[0].sum() + moved[1].sum() + up.camera.params[0] - down.camera.params[0]
-        torch.testing.assert_close((gradient * step).sum(), 0.5 * difference, rtol=1e-5, atol=1e-10)
+        expected = sum((slopes[name] * step).sum() for name, step in steps.items())
+        torch.testing.assert_close(expected, 0.5 * difference, rtol=1e-5, atol=1e-10)
     covariance = solution.covariance()
     assert (covariance.frames.diagonal(dim1=1, dim2=2) > 0).all()
     assert (torch.linalg.eigvalsh(covariance.points) > 0).all()
