@@ -32,7 +32,7 @@ from torchslam.optim._core.tangent import CameraPrior
 from torchslam.optim.bundle._problem import BundleProblem
 from torchslam.optim.bundle._scores import focal_scores
 from torchslam.optim.bundle._solve import solve_bundle
-from torchslam.optim.model_choice import LEAST_UPDATE, STRETCHES, Gain
+from torchslam.optim.model_choice import LEAST_GAIN, STRETCHES, Gain
 from torchslam.optim.run_graph import RunGraph, camera_prior, keyframe_problem
 
 NODES, FINE_NODES = 24, 120
@@ -48,8 +48,10 @@ on a zoom is undone: errors of the lens are shared by all points, and a held-out
 117 windows of 12, 24 and 40 keyframes and whole recordings without a known change, one has both (.0038, .035); garden,
 whose focal length changes by 1 %, has up to .005 and .05. Rendered changes of 2 % have .0061 and .06 or more."""
 WALKS = 3e-4, 1e-3, 3e-3, 1e-2, math.inf
-"""Standard deviations of the step of the logarithm from one focal length to the next, of which that is used which
-predicts best: zooms are smooth or sudden, and an independent error in each keyframe bends the path."""
+"""Scales of the step of the logarithm from one focal length to the next, of which the smallest is used that predicts
+about as well as the best: zooms are smooth or sudden, and an independent error in each keyframe bends the path."""
+CONVEX_STEPS, ROBUST_STEPS = 8, 4
+"""Of iteratively reweighted least squares for the prior on these steps. Tried at these values only."""
 ROUNDS, SETTLED = 10, 5e-4
 """Most steps, and the largest change of a logarithm that ends them. A zoom by 1.4 of which the run knew nothing takes
 four to six. Tried at these values only."""
@@ -118,9 +120,10 @@ def find_zoom(
     evidence = _Evidence.of(first, shares, rank, options)
     if evidence is None:
         return None
-    nodes = evidence.moved(nodes, math.inf)
+    walk = evidence.best_walk(nodes) if is_known else math.inf
+    gain, nodes = evidence.gain(nodes, walk), evidence.moved(nodes, walk)
     logs = shares @ (nodes - nodes.mean())
-    gain, spread = evidence.gain(torch.zeros_like(nodes), math.inf), float(logs.std())
+    spread = float(logs.std())
     found = ZoomEstimate(_zoom(graph, keyframes, logs), first.camera, gain, len(first.pixels), spread)
     if not found.is_found and not (is_known and gain.total > 0):
         return found
@@ -229,20 +232,28 @@ class _Evidence:
     def best_walk(self, nodes: Float[Tensor, " F"]) -> float:
         """The smallest walk that predicts about as well as the best one."""
         gains = [self.gain(nodes, walk).total for walk in WALKS]
-        return next(walk for walk, gain in zip(WALKS, gains, strict=True) if gain > max(gains) - LEAST_UPDATE)
+        return next(walk for walk, gain in zip(WALKS, gains, strict=True) if gain > max(gains) - LEAST_GAIN)
 
     def _minimum(
         self, scores: Float[Tensor, " F"], information: Float[Tensor, "F F"], nodes: Tensor, walk: float
     ) -> Float[Tensor, " F"]:
-        """The minimum of a cost with steps of nodes that are small, but for those that are large already.
+        """The minimum of a cost with steps of nodes that are small, but for a few.
 
-        walk: standard deviation of the step from one node to the next; infinite: independent ones
+        walk: scale of the step from one node to the next; infinite: independent ones
         """
         eye = torch.eye(len(nodes), dtype=nodes.dtype, device=nodes.device)
-        difference = eye[1:] - eye[:-1]
-        precision = 1 / (walk**2 + nodes.diff().square())
-        prior = self.variance * (eye / STD**2 + difference.mT @ (precision[:, None] * difference))
-        return torch.linalg.solve(information + prior, scores + information @ nodes)
+        own = information + self.variance / STD**2 * eye
+        right = scores + information @ nodes
+        if math.isinf(walk):
+            return torch.linalg.solve(own, right)
+        difference, found = eye[1:] - eye[:-1], nodes
+        for is_convex in (*[True] * CONVEX_STEPS, *[False] * ROBUST_STEPS):
+            steps = found.diff().abs()
+            # Of total variation, which finds the large steps, and of Cauchy's distribution, which leaves them alone.
+            precision = 1 / (walk * steps.clamp_min(walk)) if is_convex else 1 / (walk**2 + steps.square())
+            prior = self.variance * difference.mT @ (precision[:, None] * difference)
+            found = torch.linalg.solve(own + prior, right)
+        return found
 
 
 @full_precision
