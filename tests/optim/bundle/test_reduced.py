@@ -10,12 +10,14 @@ from torchslam.optim import (
     BUNDLE_OPTIONS,
     BundleProblem,
     CameraPrior,
+    DepthPrior,
     Factors,
     PosePrior,
     relative_pose_error,
     solve_bundle,
 )
 from torchslam.optim.bundle import _schur as schur
+from torchslam.optim.bundle import _sparse as sparse
 from torchslam.optim.bundle._reduced import MOST_CAMERAS, SPARSE_FRAMES, BlockReduced, covisible_pairs
 
 CONVERGED = BUNDLE_OPTIONS.replace(kernel="cauchy", scale=2.0, iterations=60, tolerance=1e-18)
@@ -204,3 +206,23 @@ def test_blocks_are_numbered_by_the_pairs_that_share_a_point_or_a_factor():
         [none, 9, none, 3, none],
         [none, none, 10, none, 4],
     ]
+
+
+@pytest.mark.parametrize("free_camera", [False, True])
+@pytest.mark.parametrize("with_depths", [False, True])
+def test_observations_in_runs_give_the_same_bytes(free_camera, with_depths, monkeypatch):
+    """Those of large problems are linearized in runs, which bounds the memory."""
+    problem = walk(frames=35)
+    if with_depths:
+        seen = transform(problem.T_cw[problem.frame_index], problem.points_w[problem.point_index][:, None])
+        depths, information = seen[:, 0, 2], torch.full((len(seen),), 4.0, dtype=torch.float64)
+        problem = replace(problem, depth_prior=DepthPrior(depths, information))
+    options = CONVERGED.replace(iterations=2)
+    found = []
+    for at_once in (schur.AT_ONCE, 100):
+        for module in (schur, sparse):
+            monkeypatch.setattr(module, "AT_ONCE", at_once)
+        solution = solve_bundle(problem, free_camera=free_camera, options=options)
+        parts = solution.T_cw, solution.points_w, solution.camera.params, solution.cost
+        found.append([part.numpy().tobytes() for part in parts])
+    assert found[0] == found[1]

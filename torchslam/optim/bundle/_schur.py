@@ -11,7 +11,7 @@ Source: Triggs et al., "Bundle adjustment: a modern synthesis", 1999, section 6.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
@@ -43,6 +43,11 @@ _MANY_FRAMES = 64
 """Frames from which on the tiles are smaller."""
 
 
+AT_ONCE = 1 << 17
+"""Observations whose blocks are computed at once, 80 MB, or those of a single frame. With 8,000 or 65,000 an adjustment
+takes the same time but for a second linearization, a tenth of it, where observations are more."""
+
+
 class Columns(NamedTuple):
     """The frames or the cameras of a tile, ascending, and the slice of the coupling's rows with its blocks."""
 
@@ -67,8 +72,14 @@ class Coupling(NamedTuple):
 
     def stored(self, blocks: Float[Tensor, "M 3 n"]) -> Float[Tensor, "S n"]:
         """The blocks as they are stored, summed where a point and a member have several."""
-        flat = blocks.reshape(len(self.rows), blocks.shape[2])
-        return flat.new_zeros(self.size, blocks.shape[2]).index_add_(0, self.rows, flat)
+        return self.add(blocks.new_zeros(self.size, blocks.shape[2]), blocks, 0)
+
+    def add(
+        self, stored: Float[Tensor, "S n"], blocks: Float[Tensor, "m 3 n"], first: int
+    ) -> Float[Tensor, "S n"]:
+        """Add blocks, from number `first` on, to those that are stored."""
+        rows = self.rows[3 * first : 3 * (first + len(blocks))]
+        return stored.index_add_(0, rows, blocks.reshape(len(rows), stored.shape[1]))
 
 
 @dataclass(frozen=True)
@@ -131,17 +142,23 @@ class Structure:
         """Sums over each pair's observations."""
         return self.by_pair.sum(values[None])[0]
 
-    def sum_by_frame(self, values: Float[Tensor, "... O"]) -> Float[Tensor, "K ..."]:
-        """Sums over each free frame's observations."""
-        return _sum_runs(values, self.frame_ends)
+    def runs(self) -> Iterator[tuple[slice, list[int]]]:
+        """The observations by free frames in runs of whole frames, each with the ends of its frames in it."""
+        begin, ends = 0, list[int]()
+        for end in self.frame_ends:
+            if ends and end - begin > AT_ONCE:
+                yield slice(begin, begin + ends[-1]), ends
+                begin, ends = begin + ends[-1], []
+            ends.append(end - begin)
+        yield slice(begin, self.num_linked), ends
 
     def sum_by_camera(self, values: Float[Tensor, "... O"]) -> Float[Tensor, "C ..."]:
         """Sums over each camera's observations."""
         ordered = values if self.by_camera is None else values.index_select(-1, self.by_camera)
-        return _sum_runs(ordered, self.camera_ends)
+        return sum_runs(ordered, self.camera_ends)
 
 
-def _sum_runs(values: Float[Tensor, "... O"], ends: Sequence[int]) -> Float[Tensor, "R ..."]:
+def sum_runs(values: Float[Tensor, "... O"], ends: Sequence[int]) -> Float[Tensor, "R ..."]:
     """Sums over consecutive runs."""
     sums = [values[..., begin:end].sum(-1) for begin, end in pairwise((0, *ends))]
     return torch.stack(sums) if sums else values.new_zeros(0, *values.shape[:-1])
@@ -276,12 +293,13 @@ class NormalEquations:
         """
         root = factorize(_damped(self.points, damping), strict=damping is None).inverse_root()
         root = torch.where(self.free_points[:, None, None], root, 0.0)
-        tiles = [self._whitened(tile, root) for tile in self.structure.tiles]
         directions = None if gauge is None else gauge.flatten(0, 1)
         find = self._dense if self.structure.pairs is None else self._blocks
-        return FactorizedEquations(self, root, tiles, find(tiles, damping, directions))
+        return FactorizedEquations(self, root, find(self.whitened(root), damping, directions))
 
-    def _dense(self, tiles: list[WhitenedTile], damping: Tensor | None, gauge: Tensor | None) -> DenseReduced:
+    def _dense(
+        self, tiles: Iterable[TileCoupling], damping: Tensor | None, gauge: Tensor | None
+    ) -> DenseReduced:
         """The reduced system as one matrix."""
         frame_rows, camera_rows = self.rows
         size = frame_rows.numel() + camera_rows.numel()
@@ -306,7 +324,7 @@ class NormalEquations:
         return DenseReduced(factor, self.structure.num_frames)
 
     def _blocks(
-        self, tiles: list[WhitenedTile], damping: Tensor | None, gauge: Tensor | None
+        self, tiles: Iterable[TileCoupling], damping: Tensor | None, gauge: Tensor | None
     ) -> BlockReduced:
         """The reduced system as blocks of covisible pairs, with the cameras as a border."""
         pairs, dims = self.structure.pairs, FRAME_DIMS
@@ -355,17 +373,23 @@ class NormalEquations:
         rows = torch.arange(split + num_cameras * num_free, device=self.frames.device)
         return rows[:split].view(-1, FRAME_DIMS), rows[split:].view(num_cameras, num_free)
 
-    def _whitened(self, tile: Tile, root: Tensor) -> WhitenedTile:
-        """A tile's coupling times the inverse root of its points' blocks."""
+    def tiles(self) -> Iterator[TileCoupling]:
+        """The coupling of each tile with frames and cameras."""
         frame_rows, camera_rows = self.rows
-        count = tile.points.stop - tile.points.start
-        rows = frame_rows[tile.frames.members].flatten()
-        coupling = self.coupling[tile.frames.storage].view(count, 3, len(rows))
-        if camera_rows.numel():
-            more = camera_rows[tile.cameras.members].flatten()
-            of_cameras = self.camera_coupling[tile.cameras.storage].view(count, 3, len(more))
-            rows, coupling = torch.cat((rows, more)), torch.cat((coupling, of_cameras), dim=-1)
-        return WhitenedTile(tile.points, rows, (root[tile.points] @ coupling).flatten(0, 1))
+        for tile in self.structure.tiles:
+            height = 3 * (tile.points.stop - tile.points.start)
+            rows = frame_rows[tile.frames.members].flatten()
+            coupling = self.coupling[tile.frames.storage].view(height, len(rows))
+            if camera_rows.numel():
+                more = camera_rows[tile.cameras.members].flatten()
+                of_cameras = self.camera_coupling[tile.cameras.storage].view(height, len(more))
+                rows, coupling = torch.cat((rows, more)), torch.cat((coupling, of_cameras), dim=-1)
+            yield TileCoupling(tile.points, rows, coupling)
+
+    def whitened(self, root: Float[Tensor, "N 3 3"]) -> Iterator[TileCoupling]:
+        """The same times the inverse roots of the points' blocks, tile by tile: all take as much memory as these."""
+        for points, rows, W in self.tiles():
+            yield TileCoupling(points, rows, (root[points] @ W.unflatten(0, (-1, 3))).flatten(0, 1))
 
 
 def _at(rows: Int[Tensor, "M r"], columns: Int[Tensor, "M c"]) -> tuple[Tensor, Tensor]:
@@ -373,9 +397,8 @@ def _at(rows: Int[Tensor, "M r"], columns: Int[Tensor, "M c"]) -> tuple[Tensor, 
     return rows[:, :, None], columns[:, None, :]
 
 
-class WhitenedTile(NamedTuple):
-    """The points of a tile, the rows of the reduced system of its frames and cameras, and the coupling of both, times
-    the inverse root of the points' blocks."""
+class TileCoupling(NamedTuple):
+    """The points of a tile, the rows of the reduced system of its frames and cameras, and the coupling of both."""
 
     points: slice
     rows: Int[Tensor, " R"]
@@ -389,8 +412,12 @@ class FactorizedEquations:
 
     equations: NormalEquations
     points_root: Float[Tensor, "N 3 3"]
-    tiles: list[WhitenedTile]
     reduced: Reduced
+
+    @property
+    def tiles(self) -> Iterator[TileCoupling]:
+        """As of `NormalEquations.whitened`."""
+        return self.equations.whitened(self.points_root)
 
     @property
     def definite(self) -> Bool[Tensor, ""]:
@@ -439,16 +466,23 @@ class FactorizedEquations:
     def _solve_apart(self, right: BundleTangent) -> BundleTangent:
         """As `solve`, without the factors that join points."""
         reduced_right = torch.cat((right.frames.flatten(), right.cameras.flatten()))
-        halves = (self.points_root @ right.points[..., None]).squeeze(-1)
-        for points, rows, A in self.tiles:
-            reduced_right = reduced_right.index_add(0, rows, -(A.mT @ halves[points].flatten()))
+        alone, pulls = self._of_points(right.points), list[Tensor]()
+        for points, rows, W in self.equations.tiles():
+            reduced_right = reduced_right.index_add(0, rows, -(W.mT @ alone[points].flatten()))
         solution = self.reduced.solve(reduced_right[:, None]).squeeze(-1)
-        remainders = [halves[points] - (A @ solution[rows]).view(-1, 3) for points, rows, A in self.tiles]
-        halves = torch.cat(remainders) if remainders else halves  # without points there are no tiles
-        moved = (self.points_root.mT @ halves[..., None]).squeeze(-1)
+        for _, rows, W in self.equations.tiles():
+            pulls.append((W @ solution[rows]).view(-1, 3))
+        moved = (
+            alone - self._of_points(torch.cat(pulls)) if pulls else alone
+        )  # without points there are no tiles
         frame_rows, camera_rows = self.equations.rows
         moved = torch.where(self.reduced.definite, moved, 0.0)
         return BundleTangent(solution[frame_rows], moved, solution[camera_rows])
+
+    def _of_points(self, right: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
+        """The solution where only points move."""
+        halves = self.points_root @ right[..., None]
+        return (self.points_root.mT @ halves).squeeze(-1)
 
     def marginals(self) -> Marginals:
         """The diagonal blocks of H^-1."""

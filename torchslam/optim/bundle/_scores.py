@@ -17,7 +17,7 @@ from torchslam.geometry.precision import full_precision
 from torchslam.optim._core.levenberg_marquardt import GRAPH_OPTIONS, SolverOptions
 from torchslam.optim._core.residuals import Linearization, flatness, variance_factor
 from torchslam.optim.bundle._problem import BundleData, BundleEstimate, BundleProblem, sanitized
-from torchslam.optim.bundle._schur import BundleTangent, FactorizedEquations
+from torchslam.optim.bundle._schur import BundleTangent, FactorizedEquations, sum_runs
 from torchslam.optim.bundle._solve import BundleMinimization
 from torchslam.optim.bundle._sparse import SparseBundle, SparseLayout
 
@@ -126,7 +126,7 @@ def focal_scores(
     steps = [
         factorized.solve(
             BundleTangent(
-                structure.sum_by_frame(pulls * part[: structure.num_linked]),
+                sum_runs(pulls * part[: structure.num_linked], structure.frame_ends),
                 structure.sum_by_point((slope[:3] * part).mT),
                 structure.sum_by_camera(slope[3:] * part),
             )

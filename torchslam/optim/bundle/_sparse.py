@@ -35,6 +35,7 @@ from torchslam.optim._core.residuals import (
 )
 from torchslam.optim._core.tangent import cross_entries, retract, rotated
 from torchslam.optim.bundle._factors import (
+    DepthTerms,
     FactorKind,
     FrameBlocks,
     PointBlocks,
@@ -52,12 +53,14 @@ from torchslam.optim.bundle._problem import (
     prior_terms,
 )
 from torchslam.optim.bundle._schur import (
+    AT_ONCE,
     BundleTangent,
     FactorizedEquations,
     Marginals,
     NormalEquations,
     Structure,
     build_structure,
+    sum_runs,
 )
 
 Curvature = Literal["none", "definite", "exact"]
@@ -145,29 +148,34 @@ def assemble_sparse(
         exact: include the second-order terms of the rotation, for the exact Hessian
     """
     gradient, hessian = expansion
-    slope, linked = gradient[:3], structure.num_linked
-    # The columns of all blocks: against points, the gradient, against the camera.
-    moved = torch.cat((hessian[:3, :3], slope[:, None], hessian[:3, 3:]), dim=1)
-    points = structure.sum_by_point(moved[:, :4].flatten(0, 1).mT).unflatten(-1, (3, -1))
-    slope, rays_w, moved = slope[:, :linked], rays_w[:, :linked], moved[..., :linked]
-    rotated = torch.stack(cross_entries(rays_w, moved))
-    twice = torch.stack(cross_entries(rays_w, rotated[:, :3].transpose(0, 1)))
-    against_points = rotated[:, :3]
-    if exact:
-        eye = torch.eye(3, dtype=slope.dtype, device=slope.device)[..., None]
-        against_points = against_points - torch.stack(cross_entries(slope, eye))
-        outer = slope[:, None] * rays_w
-        twice = twice + 0.5 * (outer + outer.transpose(0, 1)) - outer.diagonal().sum(-1) * eye
-    coupling = structure.coupling.stored(torch.cat((moved[:, :3], against_points)).permute(2, 1, 0))
-    moved, rotated, twice = (structure.sum_by_frame(values) for values in (moved, rotated, twice))
+    points = structure.sum_by_point(hessian[:3, :3].flatten(0, 1).mT).unflatten(-1, (3, -1))
+    pull = structure.sum_by_point(gradient[:3].mT)
+    eye = torch.eye(3, dtype=rays_w.dtype, device=rays_w.device)[..., None]
+    coupling = rays_w.new_zeros(structure.coupling.size, 6)
+    sums = list[list[Tensor]]()
+    for run, ends in structure.runs():
+        slope, rays, own = gradient[:3, run], rays_w[:, run], hessian[:3, :, run]
+        # The columns of all blocks: against points, the gradient, against the camera.
+        own = torch.cat((own[:, :3], slope[:, None], own[:, 3:]), dim=1)
+        rotated = torch.stack(cross_entries(rays, own))
+        twice = torch.stack(cross_entries(rays, rotated[:, :3].transpose(0, 1)))
+        against_points = rotated[:, :3]
+        if exact:
+            against_points = against_points - torch.stack(cross_entries(slope, eye))
+            outer = slope[:, None] * rays
+            twice = twice + 0.5 * (outer + outer.transpose(0, 1)) - outer.diagonal().sum(-1) * eye
+        blocks = torch.cat((own[:, :3], against_points)).permute(2, 1, 0)
+        structure.coupling.add(coupling, blocks, run.start)
+        sums.append([sum_runs(values, ends) for values in (own, rotated, twice)])
+    moved, rotated, twice = (torch.cat(parts) for parts in zip(*sums, strict=True))
     upper = torch.cat((moved[..., :3], rotated[..., :3].mT), dim=-1)
     lower = torch.cat((rotated[..., :3], twice), dim=-1)
     rest = torch.cat((moved[..., 3:], rotated[..., 3:]), dim=1)
     return NormalEquations(
         structure,
-        BundleTangent(rest[..., 0], points[..., 3], structure.sum_by_camera(gradient[3:])),
+        BundleTangent(rest[..., 0], pull, structure.sum_by_camera(gradient[3:])),
         torch.cat((upper, lower), dim=1),
-        points[..., :3],
+        points,
         structure.sum_by_camera(hessian[3:, 3:]),
         rest[..., 1:],
         coupling,
@@ -194,6 +202,9 @@ class SparseModel:
     @cached_property
     def equations(self) -> NormalEquations:
         return self.assembled()
+
+
+_ALL = slice(None)
 
 
 class Seen(NamedTuple):
@@ -227,8 +238,8 @@ class SparseBundle:
         self.camera_of: Tensor | None = None  # where there are several, of each observation
         if len(given.params) > 1:
             self.camera_of = given.camera_of.index_select(0, rows)
-        pixels, weights = given.pixels.index_select(0, rows), given.weights.index_select(0, rows)
-        self.observations = self._observed(pixels, weights, given.params)
+        self.pixels, self.weights = given.pixels.index_select(0, rows), given.weights.index_select(0, rows)
+        self.observations = self._observed(given.params, _ALL)
         self.start = BundleEstimate(
             given.T_cw, given.points_w.index_select(0, layout.point_order), given.params
         )
@@ -236,6 +247,7 @@ class SparseBundle:
         if len(given.depths):
             information = given.depth_information.index_select(0, rows)
             self.depths = given.depths.index_select(0, rows), information
+        self.runs = [slice(at, at + AT_ONCE) for at in range(0, max(len(rows), 1), AT_ONCE)]
         self.inner_points = layout.free_points  # that may take steps of their own
         for kind in self.kinds:
             self.inner_points = self.inner_points.index_fill(0, kind.points.flatten(), False)
@@ -250,13 +262,20 @@ class SparseBundle:
 
     def evaluate(self, estimate: BundleEstimate, use_curvature: Tensor) -> SparseModel:
         curvature: Curvature = "definite" if bool(use_curvature.any()) else "none"
-        seen, terms = self._seen(estimate), self._priors(estimate, curvature)
-        lin = self._linearize(estimate, seen)
-        cost = lin.cost.sum() if terms is None else lin.cost.sum() + terms.cost
-        if self.depths is not None:
-            cost = cost + depth_terms(*self.depths, seen.points_c[:, 2], exact=False).cost.sum()
+        terms, costs, of_depths = self._priors(estimate, curvature), list[Tensor](), list[Tensor]()
+        for run in self.runs:
+            seen, lin = found = self._linearized(estimate, run)
+            costs.append(lin.cost)
+            if self.depths is not None:
+                of_depths.append(self._depth_terms(seen, run).cost)
+        kept = found if len(self.runs) == 1 else None  # else they would take most of the memory
+        cost = torch.cat(costs).sum() if terms is None else torch.cat(costs).sum() + terms.cost
+        if of_depths:
+            cost = cost + torch.cat(of_depths).sum()
         return SparseModel(
-            estimate, cost[None], lambda: _with_priors(self._equations(seen, lin, use_curvature), terms)
+            estimate,
+            cost[None],
+            lambda: _with_priors(self._equations(estimate, use_curvature, kept=kept), terms),
         )
 
     def step(self, model: SparseModel, damping: Tensor) -> tuple[BundleEstimate, Tensor]:
@@ -312,16 +331,19 @@ class SparseBundle:
 
     def _of_points(self, estimate: BundleEstimate) -> tuple[Tensor, ...]:
         """The cost (N,) of each point's observations, and its gradient (3, N) and Gauss-Newton Hessian (3, 3, N)."""
-        seen = self._seen(estimate)
-        lin = linearize(self._observations(estimate), seen.points_c)
-        J = product(lin.J.movedim(0, -1), seen.R_cw)
-        expansion = gauss_newton_expansion(lin, J, torch.zeros_like(self.solvable))
-        cost = lin.cost
-        if self.depths is not None:
-            expansion = self._with_depths(expansion, seen, exact=False)
-            cost = cost + depth_terms(*self.depths, seen.points_c[:, 2], exact=False).cost
-        every = torch.cat((cost[None], expansion.gradient, expansion.hessian.flatten(0, 1)))
-        sums = self.layout.structure.sum_by_point(every.mT).mT
+        every = estimate.points_w.new_empty(len(self.layout.observations), 13)
+        for run in self.runs:
+            seen = self._seen(estimate, run)
+            lin = linearize(self._observations(estimate, run), seen.points_c)
+            J = product(lin.J.movedim(0, -1), seen.R_cw)
+            expansion = gauss_newton_expansion(lin, J, torch.zeros_like(self.solvable))
+            cost = lin.cost
+            if self.depths is not None:
+                terms = self._depth_terms(seen, run)
+                expansion, cost = with_depths(expansion, terms, seen.R_cw[2]), cost + terms.cost
+            parts = cost[None], expansion.gradient, expansion.hessian.flatten(0, 1)
+            every[run] = torch.cat(parts).mT
+        sums = self.layout.structure.sum_by_point(every).mT
         return sums[0], sums[1:4], sums[4:].unflatten(0, (3, 3))
 
     def _point_steps(
@@ -451,14 +473,13 @@ class SparseBundle:
     def marginals(self, estimate: BundleEstimate) -> Marginals:
         """Covariances (1, K, 6, 6), (1, N, 3, 3), (1, C n, C n) in the order of the problem, zero for what stays."""
         estimate = self.ordered(estimate)
-        seen = self._seen(estimate)
-        lin = self._linearize(estimate, seen)
+        everything = self._linearized(estimate, slice(None))
         layout, structure = self.layout, self.layout.structure
         num_cameras = 0 if self.directions is None else len(estimate.params) * self.directions.shape[1]
         num_parameters = 6 * structure.num_frames + 3 * int(layout.free_points.sum()) + num_cameras
-        factor = variance_factor(self.observations, lin, num_parameters)
+        factor = variance_factor(self.observations, everything[1], num_parameters)
         # Priors, depths and factors are in absolute units, which the residuals do not calibrate.
-        equations = self._equations(seen, lin, torch.zeros_like(self.solvable), share=factor)
+        equations = self._equations(estimate, torch.zeros_like(self.solvable), factor, everything)
         equations = _with_priors(equations, self._priors(estimate), share=factor)
         free, points, camera = equations.factorized(gauge=self._gauge(estimate)).marginals()
         R_cw = estimate.T_cw[layout.free_frames, :3, :3]
@@ -472,9 +493,8 @@ class SparseBundle:
     ) -> tuple[Linearization, Float[Tensor, "2 m O"], Float[Tensor, "3 O"], FactorizedEquations]:
         """Linearize the observations alone at an estimate in the layout's order: residuals, their derivatives in the
         point and the camera, the rays from frames to points, in the axes of the world, and the factorized equations."""
-        seen = self._seen(estimate)
-        lin = self._linearize(estimate, seen)
-        equations = self._equations(seen, lin, torch.zeros_like(self.solvable))
+        seen, lin = everything = self._linearized(estimate, slice(None))
+        equations = self._equations(estimate, torch.zeros_like(self.solvable), kept=everything)
         J = self._in_world(lin.J.movedim(0, -1), seen.R_cw)
         return lin, J, seen.rays_w, equations.factorized(gauge=self._gauge(estimate))
 
@@ -496,17 +516,18 @@ class SparseBundle:
 
         return solve
 
-    def _seen(self, estimate: BundleEstimate) -> Seen:
+    def _seen(self, estimate: BundleEstimate, run: slice = _ALL) -> Seen:
         R_cw = estimate.T_cw[:, :3, :3]
         centers_w = -(R_cw.mT @ estimate.T_cw[:, :3, 3:])
         frames = torch.cat((R_cw.flatten(1), centers_w[..., 0]), dim=-1)
-        rows = frames.index_select(0, self.layout.frame_index).mT.contiguous()
+        rows = frames.index_select(0, self.layout.frame_index[run]).mT.contiguous()
         R_cw = rows[:9].unflatten(0, (3, 3))
-        rays_w = estimate.points_w.index_select(0, self.layout.point_index).mT - rows[9:]
+        rays_w = estimate.points_w.index_select(0, self.layout.point_index[run]).mT - rows[9:]
         return Seen(R_cw, rays_w, product(R_cw, rays_w[:, None])[:, 0].mT)
 
-    def _linearize(self, estimate: BundleEstimate, seen: Seen) -> Linearization:
-        return linearize(self._observations(estimate), seen.points_c, self.directions is not None)
+    def _linearized(self, estimate: BundleEstimate, run: slice) -> tuple[Seen, Linearization]:
+        seen, is_free = self._seen(estimate, run), self.directions is not None
+        return seen, linearize(self._observations(estimate, run), seen.points_c, is_free)
 
     def _in_world(self, rows: Tensor, R_cw: Tensor) -> Tensor:
         """Derivatives (m, 3 + P, O') in points_c and the camera, as such in points_w and what moves of the camera."""
@@ -515,34 +536,46 @@ class SparseBundle:
             return points
         return torch.cat((points, self.directions.mT @ rows[:, 3:]), dim=1)
 
-    def _observed(self, pixels: Tensor, weights: Tensor, params: Tensor) -> ReprojectionData:
+    def _observed(self, params: Tensor, run: slice) -> ReprojectionData:
         camera = self.camera.with_params(params)
-        camera = camera[0] if self.camera_of is None else camera[self.camera_of]
-        return ReprojectionData(pixels, weights, camera, self.kernel, self.given.scale)
+        camera = camera[0] if self.camera_of is None else camera[self.camera_of[run]]
+        return ReprojectionData(self.pixels[run], self.weights[run], camera, self.kernel, self.given.scale)
 
-    def _observations(self, estimate: BundleEstimate) -> ReprojectionData:
-        if self.directions is None:
+    def _observations(self, estimate: BundleEstimate, run: slice = _ALL) -> ReprojectionData:
+        if self.directions is None and len(self.runs) == 1:
             return self.observations
-        return self._observed(self.observations.pixels, self.observations.weights, estimate.params)
+        return self._observed(estimate.params, run)
 
     def _equations(
-        self, seen: Seen, lin: Linearization, use_curvature: Tensor, share: Tensor | float = 1.0
+        self,
+        estimate: BundleEstimate,
+        use_curvature: Tensor,
+        share: Tensor | float = 1.0,
+        kept: tuple[Seen, Linearization] | None = None,
     ) -> NormalEquations:
-        """Without the curvature of the projection, and without priors; with a share of the depths."""
-        J = self._in_world(lin.J.movedim(0, -1), seen.R_cw)
-        expansion = gauss_newton_expansion(lin, J, use_curvature)
-        expansion = self._with_depths(expansion, seen, exact=False, share=share)
-        layout = self.layout
-        return assemble_sparse(layout.structure, expansion, seen.rays_w, layout.free_points, exact=False)
+        """Without the curvature of the projection, and without priors; with a share of the depths.
 
-    def _with_depths(
-        self, expansion: Expansion, seen: Seen, exact: bool, share: Tensor | float = 1.0
-    ) -> Expansion:
-        if self.depths is None:
-            return expansion
+        kept: `_linearized` of all observations, if it is known
+        """
+        layout, size = self.layout, 3 + (0 if self.directions is None else self.directions.shape[1])
+        gradient = estimate.points_w.new_empty(size, len(layout.observations))
+        hessian, rays_w = gradient.new_empty(size, *gradient.shape), torch.empty_like(gradient[:3])
+        for run in self.runs if kept is None else [_ALL]:
+            seen, lin = kept or self._linearized(estimate, run)
+            J = self._in_world(lin.J.movedim(0, -1), seen.R_cw)
+            expansion = gauss_newton_expansion(lin, J, use_curvature)
+            if self.depths is not None:
+                expansion = with_depths(expansion, self._depth_terms(seen, run, share), seen.R_cw[2])
+            gradient[:, run], hessian[..., run], rays_w[:, run] = *expansion, seen.rays_w
+        expansion = Expansion(gradient, hessian)
+        return assemble_sparse(layout.structure, expansion, rays_w, layout.free_points, exact=False)
+
+    def _depth_terms(
+        self, seen: Seen, run: slice, share: Tensor | float = 1.0, exact: bool = False
+    ) -> DepthTerms:
+        assert self.depths is not None
         depths, information = self.depths
-        terms = depth_terms(depths, share * information, seen.points_c[:, 2], exact)
-        return with_depths(expansion, terms, seen.R_cw[2])
+        return depth_terms(depths[run], share * information[run], seen.points_c[:, 2], exact)
 
     def _exact_equations(self, estimate: BundleEstimate) -> NormalEquations:
         seen = self._seen(estimate)
@@ -551,7 +584,9 @@ class SparseBundle:
         gradient, hessian = exact_expansion(observations, points_c, is_free)
         half = self._in_world(hessian.movedim(0, -1), R_cw).transpose(0, 1)
         expansion = Expansion(self._in_world(gradient.mT[None], R_cw)[0], self._in_world(half, R_cw))
-        expansion = self._with_depths(expansion, seen, exact=True)
+        if self.depths is not None:
+            terms = self._depth_terms(seen, _ALL, exact=True)
+            expansion = with_depths(expansion, terms, R_cw[2])
         layout = self.layout
         equations = assemble_sparse(layout.structure, expansion, rays_w, layout.free_points, exact=True)
         return _with_priors(equations, self._priors(estimate, "exact"))
