@@ -11,7 +11,6 @@ from typing import NamedTuple
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
-from torch import Tensor
 
 from torchslam.geometry.camera import Camera
 from torchslam.geometry.lie import rigid
