@@ -480,7 +480,14 @@ def test_angle_of_a_blender_scene(tmp_path: Path) -> None:
     ("text", "message"),
     [
         ('{"camera_angle_x": 40, "w": 640, "h": 480, "frames": []}', "camera_angle_x is 40, no angle"),
-        ('{"fx": 0.8, "fy": 1.1, "cx": 0.5, "cy": 0.5}', "0.8 and 1.1 pixels: are they parts of the width"),
+        (
+            '{"fx": 500, "fy": 500, "cx": 0, "cy": 0, "width": 640, "height": 480}',
+            "the principal point 0, 0: are",
+        ),
+        (
+            '{"fx": 0.8, "fy": 1.1, "cx": 0.5, "cy": 0.5}',
+            "0.8, 1.1 pixels with the principal point 0.5, 0.5: are these parts",
+        ),
     ],
 )
 def test_focal_lengths_in_other_units(tmp_path: Path, text: str, message: str) -> None:

@@ -41,14 +41,7 @@ COMMANDS = {
     "config": "print every setting with its description, range and default, as TOML for --config",
     "download": "download a public sequence or weights; an interrupted transfer is resumed",
 }
-SMALL = (
-    "demo",
-    "eval",
-    "plot",
-    "info",
-    "config",
-    "download",
-)  # in the module `commands`; others have their own
+SMALL = ("demo", "eval", "plot", "info", "config", "download")  # in `commands`; others have their own module
 
 # These compute nothing, and import torch only where a sequence is opened.
 WITHOUT_THREADS = ("app", "config", "info")

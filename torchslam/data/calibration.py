@@ -71,10 +71,12 @@ class Calibration:
             raise CalibrationError(
                 f"{source}: focal lengths must be positive, got {numbers[0]:g} and {numbers[1]:g}"
             )
-        if min(numbers[:2]) < LEAST_FOCAL_PX:
+        at_corner = size is not None and -1 <= min(numbers[2:4]) <= max(numbers[2:4]) <= 1
+        if min(numbers[:2]) < LEAST_FOCAL_PX or at_corner:
+            focal, center = (f"{one:g}, {other:g}" for one, other in (numbers[:2], numbers[2:4]))
             raise CalibrationError(
-                f"{source}: focal lengths of {numbers[0]:g} and {numbers[1]:g} pixels: are they parts of the width or "
-                "of the height of the image? Give pixels"
+                f"{source}: focal lengths of {focal} pixels with the principal point {center}: are these parts of the "
+                "width or of the height of the image? Give pixels"
             )
         if size is not None and min(size) <= 0:
             raise CalibrationError(

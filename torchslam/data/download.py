@@ -69,12 +69,7 @@ def download_weights(name: str, directory: str | Path | None = None, base_url: s
     return path
 
 
-def download(
-    name: str,
-    directory: str | Path,
-    base_url: str = ETH3D_URL,
-    sha256: str | None = None,
-) -> Path:
+def download(name: str, directory: str | Path, base_url: str = ETH3D_URL, sha256: str | None = None) -> Path:
     """Fetch `eth3d/NAME` (its monocular archive) into `directory`; returns the folder of the sequence.
 
     A transfer that breaks off is taken up where it stopped, in this call or the next one; a sequence that is there

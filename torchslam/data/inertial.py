@@ -24,6 +24,7 @@ from torchslam.data.text_file import float64
 from torchslam.data.trajectories import ORTHOGONAL, orthogonality_error
 from torchslam.errors import CalibrationError, MeasurementError
 from torchslam.geometry.lie import rigid, se3_inverse
+from torchslam.geometry.similarity import nearest_rotation
 
 AXES = ("x", "y", "z")
 STANDARD_GRAVITY = 9.80665
@@ -228,5 +229,4 @@ def _rigid(numbers: list[float], path: Path) -> Float[Tensor, "4 4"]:
         raise MeasurementError(f"{path}: the transformation between camera and body is not rigid")
     if lever > 10:
         raise MeasurementError(f"{path}: {lever:g} m between camera and body; is it in meters?")
-    U, _, Vh = torch.linalg.svd(R)
-    return rigid(U @ Vh, T[:3, 3])
+    return rigid(nearest_rotation(R), T[:3, 3])

@@ -23,10 +23,7 @@ Errors = TypeVar("Errors")
 
 
 def compute_metrics(
-    finished: Run,
-    sequence: Sequence,
-    camera: str,
-    log: Callable[[str], None] = lambda words: None,
+    finished: Run, sequence: Sequence, camera: str, log: Callable[[str], None] = lambda words: None
 ) -> dict[str, Any]:
     """Compute the content of metrics.json, with the errors if there are ground truth and poses to compare.
 
@@ -106,9 +103,7 @@ FEW = 10
 
 
 def run_metrics(
-    run: Run,
-    evaluation: Evaluation | None = None,
-    online_ate_m: float | None = None,
+    run: Run, evaluation: Evaluation | None = None, online_ate_m: float | None = None
 ) -> dict[str, Any]:
     """Compute the metrics of a run, the content of metrics.json.
 

@@ -273,20 +273,9 @@ def prepare(folder: Path, overwrite: bool, resume: bool) -> None:
 
 def results_in(directory: Path) -> list[Path]:
     """Return the files in a folder that a run would replace."""
-    names = (
-        METRICS,
-        TRAJECTORY,
-        MAP,
-        GRAPH,
-        LOOPS,
-        KEYFRAMES,
-        ONLINE,
-        GROUND_TRUTH,
-        POINT_CLOUD,
-        CONFIG,
-        FRAMES,
-    )
-    return [directory / name for name in (*names, EXAMPLE_IMAGE) if (directory / name).exists()]
+    tables = (METRICS, TRAJECTORY, KEYFRAMES, ONLINE, GROUND_TRUTH, CONFIG, FRAMES)
+    names = (*tables, MAP, GRAPH, LOOPS, POINT_CLOUD, EXAMPLE_IMAGE)
+    return [directory / name for name in names if (directory / name).exists()]
 
 
 def delete_unfinished(folder: Path) -> None:

@@ -28,13 +28,12 @@ from torchslam.loop_closing.records import write_closures
 from torchslam.map.file import write_atlas
 from torchslam.map.map import Map
 from torchslam.map.unit import MetricUnit
+from torchslam.metric.camera_path import SINCE_1970
 from torchslam.system.run import Run
 from torchslam.types import StepResult, Trajectory
 
 GEOJSON = "trajectory.geojson"
 GPX = "trajectory.gpx"
-SINCE_1970 = 1e8
-"""Seconds: times from here on (1973) are dates, smaller ones count from the start of a recording."""
 DIGITS = 9
 """Decimals of degrees: a tenth of a millimeter."""
 

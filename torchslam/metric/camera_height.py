@@ -111,9 +111,7 @@ def ground_heights(view: SubmapView) -> Float[np.ndarray, " R"]:
         if around is None or reference is None:
             continue
         direction_w, beside = around
-        images = {each: view.gray(int(view.frame_index[each])) for each in beside}
-        others = {each: image for each, image in images.items() if image is not None}
-        if not others:
+        if not (others := view.grays(beside)):
             continue
         fit = _PlaneFit(
             windows,

@@ -230,8 +230,7 @@ class _Sweep:
             places = torch.linspace(0, len(rows) - 1, FRAMES, dtype=torch.float64, device="cpu")
             rows = rows[places.round().long()]
         reference = view.gray(int(view.frame_index[center]))
-        images = {row: view.gray(int(view.frame_index[row])) for row in rows.tolist()}
-        others = {row: image for row, image in images.items() if image is not None}
+        others = view.grays(rows.tolist())
         if reference is None or len(others) < LEAST_FRAMES:
             return None
         return cls(camera, pixel, reference, list(others.values()), T_oc[list(others)])

@@ -14,9 +14,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchslam.data.inertial import InertialCalibration, InertialSamples
-from torchslam.geometry import se3_inverse, so3_log, umeyama
+from torchslam.geometry import se3_inverse, umeyama
 from torchslam.geometry.transforms import signed_axes
-from torchslam.metric.inertial_rotation import TURN_INTERVAL, increments, start_offset, thinned
+from torchslam.metric.inertial_rotation import TURN_INTERVAL, mean_rates, start_offset, thinned
 
 BETTER = 0.7
 """Ratio of the errors of another reading to those of the given one, up to which it is tried: right axes have less than
@@ -38,10 +38,8 @@ def other_readings(
     times, R_cw = timestamps[nodes], T_cw[nodes, :3, :3]
     turns_c = R_cw[:-1] @ R_cw[1:].mT
     times = times + start_offset(times, turns_c, samples, calibration.offset)
-    found = increments(samples, times[:-1], times[1:], torch.zeros_like(samples.gyroscope[0]))
-    duration = found.duration[:, None]
-    rates_c, rates_b = so3_log(turns_c) / duration, so3_log(found.R_ij) / duration
-    forces, signed = found.velocity / duration, signed_axes(T_cw)
+    rates_c, rates_b, forces = mean_rates(times, turns_c, samples)
+    signed = signed_axes(T_cw)
 
     mountings = [("", calibration)]
     if calibration.T_bc is not None:

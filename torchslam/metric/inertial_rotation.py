@@ -152,13 +152,18 @@ def _correlation(a: Tensor, b: Tensor, valid: Tensor) -> tuple[Tensor, Tensor]:
     return ab / (aa.sqrt() * bb.sqrt()), ab / aa
 
 
+def mean_rates(times: Tensor, turns_c: Tensor, samples: InertialSamples) -> tuple[Tensor, Tensor, Tensor]:
+    """Rates of the camera and of the sensor, rad/s, and forces, m/s^2, in the intervals of times."""
+    found = increments(samples, times[:-1], times[1:], torch.zeros_like(samples.gyroscope[0]))
+    duration = found.duration[:, None]
+    return so3_log(turns_c) / duration, so3_log(found.R_ij) / duration, found.velocity / duration
+
+
 def _start_rotation(
     times: Tensor, turns_c: Tensor, samples: InertialSamples, T_bc: Tensor | None
 ) -> tuple[Tensor, Tensor]:
     """R_bc and the bias, from rotation vectors of both sensors."""
-    found = increments(samples, times[:-1], times[1:], torch.zeros_like(samples.gyroscope[0]))
-    duration = found.duration[:, None]
-    rates_c, rates_b = so3_log(turns_c) / duration, so3_log(found.R_ij) / duration
+    rates_c, rates_b, _ = mean_rates(times, turns_c, samples)
     if T_bc is None:
         _, R_bc, bias = umeyama(rates_c, rates_b, with_scale=False)
         return R_bc, bias

@@ -147,6 +147,11 @@ class SubmapView:
         """Whether there are images to look at."""
         return self.sequence is not None and not self.sequence.brings_features
 
+    def grays(self, rows: list[int]) -> dict[int, Float[np.ndarray, "H W"]]:
+        """The images of rows of the view that can be read, gray in [0, 1]."""
+        images = {row: self.gray(int(self.frame_index[row])) for row in rows}
+        return {row: image for row, image in images.items() if image is not None}
+
     def gray(self, frame_index: int) -> Float[np.ndarray, "H W"] | None:
         """The image of a frame, gray in [0, 1]; None if there is none, or it cannot be read."""
         try:

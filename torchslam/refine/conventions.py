@@ -100,7 +100,7 @@ def fitting_reading(
     if len(pairs) < MIN_PAIRS:
         return 1.0, []
     signed = signed_axes(poses)
-    readings, motions = [], []
+    readings, motions = list[Reading](), list[Tensor]()
     for inverted, swapped in product((False, True), repeat=2):
         R_cw = poses[:, :3, :3]
         R_cw = R_cw if world_to_camera != inverted else R_cw.mT
@@ -111,7 +111,7 @@ def fitting_reading(
         t_21 = R_2 @ (centers[pairs[:, 0]] - centers[pairs[:, 1]])
         axes = signed[:, None]
         motions.append(rigid(axes @ (R_2 @ R_1.mT) @ axes.mT, (axes @ t_21)[..., 0]))
-        readings += [(inverted, swapped, each) for each in signed]
+        readings += [Reading(inverted, swapped, each, 0.0) for each in signed]
     across, along = epipolar_offsets(torch.cat(motions), pixels_1[None], pixels_2[None], camera, camera)
     every = torch.maximum(across.abs(), -along).median(-1).values / camera.focal
     for tolerance in TOLERANCES:
@@ -121,6 +121,6 @@ def fitting_reading(
         if shares.max() >= MIN_FITTING and shares[0] < MAX_AS_GIVEN * shares.max():
             lost, gained = (best & ~agrees).sum(-1), (agrees & ~best).sum(-1)
             tied = torch.nonzero(lost - gained <= TIED * (lost + gained).sqrt())[:, 0].tolist()
-            found = [Reading(*readings[row], float(shares[row])) for row in tied]
+            found = [readings[row]._replace(share=float(shares[row])) for row in tied]
             return float(shares[0]), sorted(found, key=lambda each: (each.changes, -each.share))
     return float(shares[0]), []

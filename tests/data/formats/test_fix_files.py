@@ -197,6 +197,15 @@ def test_exif_of_images(tmp_path: Path) -> None:
         read_fixes(tmp_path)
 
 
+def test_minutes_above_60_are_refused(tmp_path: Path) -> None:
+    image = Image.new("L", (8, 8))
+    exif = image.getexif()
+    exif.get_ifd(0x8825).update({1: "N", 2: (48.0, 700.0, 0.0), 3: "E", 4: (11.0, 0.0, 0.0)})
+    image.save(tmp_path / "0.jpg", exif=exif)
+    with pytest.raises(MeasurementError, match=r"0.jpg: .*minutes or seconds of a position above 60"):
+        read_fixes(tmp_path)
+
+
 def test_packets_of_kitti(tmp_path: Path) -> None:
     (tmp_path / "oxts" / "data").mkdir(parents=True)
     (tmp_path / "oxts" / "timestamps.txt").write_text(
@@ -240,6 +249,11 @@ def test_packets_of_kitti(tmp_path: Path) -> None:
         ("a.gpx", "<gpx><trkpt lat='1' lon='2'/></gpx>", "point 1: no time"),
         ("a.gpx", "<gpx><trkpt lat='x' lon='2'><time>2024-05-01</time></trkpt></gpx>", "`x` is not a number"),
         ("a.nmea", "$GPGGA,000001,4800.0,X,01100.0,E,1,8,1,5,M,4,M,,\n", "`4800.0,X` is not a latitude"),
+        (
+            "a.nmea",
+            "$GPGGA,000001,4800.0,N,01100.0,E,1,8,1,5,F,4,M,,\n",
+            "unit of the altitude is `F`, not M",
+        ),
     ],
 )
 def test_wrong_files_are_refused(tmp_path: Path, name: str, content: str, message: str) -> None:

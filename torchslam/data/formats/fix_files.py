@@ -228,6 +228,8 @@ def _nmea_rows(rows: list[tuple[str, float, list[str]]]) -> Iterator[Fix]:
             latitude = _degrees(fields[at], fields[at + 1], "NS", where)
             longitude = _degrees(fields[at + 2], fields[at + 3], "EW", where)
         altitude = parse_known(fields[9], where, MeasurementError) if kind == "GGA" else math.nan
+        if kind == "GGA" and "".join(fields[10:11]) not in ("", "M"):
+            raise MeasurementError(f"{where}: the unit of the altitude is `{fields[10][:100]}`, not M")
         yield Fix(where, latitude, longitude, altitude, start + days[epoch] + clock)
 
 
@@ -282,7 +284,9 @@ def _image_fix(path: Path) -> Fix | None:
         block = exif_block(path, 0x8825)  # of the position, by the tags of EXIF 2.32
         if 2 not in block or 4 not in block:
             return None
-        sides = ((block[tag], str(block.get(tag - 1, ""))) for tag in (2, 4))
+        sides = [(tuple(block[tag]), str(block.get(tag - 1, ""))) for tag in (2, 4)]
+        if any(float(part) >= 60 for parts, _ in sides for part in parts[1:]):
+            raise ValueError("minutes or seconds of a position above 60")
         latitude, longitude = (
             signed_degrees(sum(float(part) / 60**power for power, part in enumerate(parts)), side, letters)
             for (parts, side), letters in zip(sides, ("NS", "EW"), strict=True)

@@ -44,20 +44,9 @@ class Found(NamedTuple):
         return [f"ignored: {kinds}"] if kinds else []
 
 
-CAMERA_WORDS = {
-    "cam",
-    "camera",
-    "image",
-    "img",
-    "sensor",
-    "lens",
-    "eye",
-    "view",
-    "rgb",
-    "color",
-    "imager",
-    "stereo",
-}
+CAMERA_WORDS = frozenset(
+    ("cam", "camera", "image", "img", "sensor", "lens", "eye", "view", "rgb", "color", "imager", "stereo")
+)
 """Words before the number of a camera."""
 MAX_CAMERAS = 8  # of a rig whose images are in one folder
 LEAST_ALIKE = (

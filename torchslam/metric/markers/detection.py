@@ -304,9 +304,7 @@ def fit_corners(
     return quads, found
 
 
-def sides(
-    quads: Float[np.ndarray, "M 4 2"],
-) -> tuple[Float[np.ndarray, "M 4 2"], Float[np.ndarray, "M 4 2"]]:
+def sides(quads: Float[np.ndarray, "M 4 2"]) -> tuple[Float[np.ndarray, "M 4 2"], Float[np.ndarray, "M 4 2"]]:
     """Vectors from each corner to the next, and their unit normals to the left, as the image shows it."""
     along = np.roll(quads, -1, axis=1) - quads
     normal = np.stack((along[..., 1], -along[..., 0]), axis=-1)

@@ -70,9 +70,7 @@ class Markers:
     """
 
     def __init__(
-        self,
-        targets: Sequence[Target],
-        make_detector: Callable[[Target, Camera], Detector] = detector_of,
+        self, targets: Sequence[Target], make_detector: Callable[[Target, Camera], Detector] = detector_of
     ) -> None:
         """Take the targets, and what makes a detector of one of them; OpenCV's by default."""
         self._targets, self._make_detector = tuple(targets), make_detector
