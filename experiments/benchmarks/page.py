@@ -1,6 +1,6 @@
-"""Frames a second of the page of `torchslam app` with a large result, in headless Chromium: python -m experiments.benchmarks.page
+"""Frames a second of the page of `torchslam app` with a large result: python -m experiments.benchmarks.page
 
-Needs Chromium, playwright and the extra `app`. Chromium draws in software, without a GPU.
+Needs Chromium, playwright and the extra `app`. Headless Chromium draws in software, without a GPU.
 """
 
 from __future__ import annotations
