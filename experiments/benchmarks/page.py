@@ -103,7 +103,8 @@ def main() -> None:
         page = browser.new_page(viewport={"width": 1280, "height": 800})
         page.add_init_script(COUNT)
         page.goto(f"http://localhost:{listening.getsockname()[1]}/")
-        page.wait_for_function("window.drawn.some(([, count]) => count > 5000)", timeout=300_000)
+        while not page.evaluate("window.drawn.some(([, count]) => count > 5000)"):
+            page.wait_for_timeout(100)
         page.mouse.move(400, 400)
         page.mouse.down()
         for name, seconds in (("settling", SECONDS), ("moving", SECONDS)):

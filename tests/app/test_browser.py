@@ -193,10 +193,17 @@ def test_a_result_is_cropped_played_set_up_and_compared(page: Any, mapped: Path,
     wait_until(lambda: page.evaluate(TURN) != before, 30)
 
     whole = count(page, "points")
-    track = page.locator(".multi-slider-track-container").first
-    box = track.bounding_box()
-    track.click(position={"x": 0.45 * box["width"], "y": box["height"] / 2})
-    wait_until(lambda: 0 < count(page, "points") < whole, 30)
+    box = page.locator(".multi-slider-track-container").first.bounding_box()
+    y = box["y"] + box["height"] / 2
+    page.mouse.move(box["x"] + 1, y)
+    page.mouse.down()
+
+    def is_cropped() -> bool:
+        page.mouse.move(box["x"] + 0.45 * box["width"], y, steps=3)
+        return 0 < count(page, "points") < whole
+
+    wait_until(is_cropped, 30)
+    page.mouse.up()
 
 
 @pytest.mark.slow  # a minute: the whole demo
