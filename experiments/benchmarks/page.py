@@ -1,21 +1,22 @@
-"""Frames a second of the page of `torchslam app` with a large result, in headless Chromium: python -m experiments.benchmarks.page
+"""Frames a second of the page of `torchslam app` with a large result: python -m experiments.benchmarks.page
 
-Needs Chromium, playwright and the extra `app`. Chromium draws in software, without a GPU.
+Needs Chromium, playwright and the extra `app`. Headless Chromium draws in software, without a GPU.
 """
 
 from __future__ import annotations
 
+import contextlib
+import os
+import resource
 import shutil
 import socket
 import tempfile
 import threading
 import time
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
-import psutil
 import uvicorn
 import viser
 from playwright.sync_api import sync_playwright
@@ -24,7 +25,12 @@ from torchslam.app.jobs import Runs
 from torchslam.app.scene import Scene
 from torchslam.app.web import Uploads, application
 
-KEYFRAMES, DENSE, FRAMES, THUMBNAILS = 2000, 500_000, 18_000, 48  # as of 2 million points, of which as many are sent
+KEYFRAMES, DENSE, FRAMES, THUMBNAILS = (
+    2000,
+    500_000,
+    18_000,
+    48,
+)  # as of 2 million points, of which as many are sent
 ARGUMENTS = ["--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
 SECONDS = 20.0  # of dragging, after those in which the number of points settles
 # Counts the points of the largest cloud in each frame that is drawn; installed before the page's own script.
@@ -63,17 +69,35 @@ def large_result() -> dict[str, Any]:
         "truth": np.zeros((0, 3)),
         "keyframe_poses": poses[rows],
         "corners": 0.07 * corners,
-        "images": {row: colors[: 72 * 96].reshape(72, 96, 3) for row in range(0, KEYFRAMES, KEYFRAMES // THUMBNAILS)},
+        "images": {
+            row: colors[: 72 * 96].reshape(72, 96, 3) for row in range(0, KEYFRAMES, KEYFRAMES // THUMBNAILS)
+        },
         "points": np.zeros((0, 3), np.float32),
         "colors": np.zeros((0, 3), np.uint8),
-        "dense": {"low": [-2, -2, -1], "step": [4 / 65535] * 2 + [2 / 65535], "points": points, "colors": colors},
+        "dense": {
+            "low": [-2, -2, -1],
+            "step": [4 / 65535] * 2 + [2 / 65535],
+            "points": points,
+            "colors": colors,
+        },
     }
+
+
+def processor_time() -> float:
+    """Seconds that the processes of the browser have computed (Linux)."""
+    ticks = 0
+    for stat in Path("/proc").glob("[0-9]*/stat"):
+        with contextlib.suppress(FileNotFoundError, ProcessLookupError):  # it has just ended
+            name, _, values = stat.read_text().rpartition(")")
+            ticks += sum(map(int, values.split()[11:13])) if "chrom" in name else 0
+    return ticks / os.sysconf("SC_CLK_TCK")
 
 
 def main() -> None:
     """Serve the result, drag the view, and print a row of the table."""
     viewer = viser.ViserServer("127.0.0.1", 0, verbose=False)
-    listening, nobody = socket.create_server(("127.0.0.1", 0)), SimpleNamespace()
+    listening = socket.create_server(("127.0.0.1", 0))
+    nobody: Any = None
     with tempfile.TemporaryDirectory() as folder, sync_playwright() as playwright:
         page_of_viewer: Any = application(viewer, Runs(Path(folder)), Uploads(Path(folder), 1), nobody)
         options: dict[str, Any] = {"log_level": "warning", "ws": "websockets-sansio"}
@@ -85,27 +109,33 @@ def main() -> None:
         page = browser.new_page(viewport={"width": 1280, "height": 800})
         page.add_init_script(COUNT)
         page.goto(f"http://localhost:{listening.getsockname()[1]}/")
-        page.wait_for_function("window.drawn.some(([, count]) => count > 5000)", timeout=300_000)
+        while not page.evaluate("window.drawn.some(([, count]) => count > 5000)"):
+            page.wait_for_timeout(100)
         page.mouse.move(400, 400)
         page.mouse.down()
         for name, seconds in (("settling", SECONDS), ("moving", SECONDS)):
             page.evaluate("window.drawn.length = 0")
-            busy, end, step = psutil.cpu_times(), time.monotonic() + seconds, 0
+            spent, end, step = processor_time(), time.monotonic() + seconds, 0
             while time.monotonic() < end:
                 step += 1
                 page.mouse.move(400 + (7 * step) % 300, 400 + (3 * step) % 100)
                 page.wait_for_timeout(15)
-            drawn, after = np.array(page.evaluate("window.drawn")), psutil.cpu_times()
-            rate = 1000 * (len(drawn) - 1) / max(1.0, drawn[-1, 0] - drawn[0, 0])
-            share = 1 - (after.idle - busy.idle) / (seconds * (psutil.cpu_count() or 1))
-            print(f"{name}: {rate:.1f} frames a second, {np.median(drawn[:, 1]):.0f} points; machine {share:.0%} busy")
+            drawn, spent = np.array(page.evaluate("window.drawn")), processor_time() - spent
+            rate, each = (len(drawn) - 1) / seconds, 1000 * spent / len(drawn)
+            points = np.median(drawn[:, 1])
+            print(
+                f"{name}: {rate:.1f} frames/s, {points:.0f} points, {each:.0f} ms of processor time a frame",
+                flush=True,
+            )
         page.mouse.up()
         page.evaluate("window.drawn.length = 0")
         page.wait_for_timeout(6000)
         drawn = np.array(page.evaluate("window.drawn"))
-        memory = psutil.Process().memory_info().rss / 1e6
-        print(f"at rest: {drawn[:, 1].max():.0f} points; memory of the server {memory:.0f} MB; load {psutil.getloadavg()}")
-        page.screenshot(path="/tmp/h/a/page.png")
+        memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3
+        load = os.getloadavg()[0]
+        print(
+            f"at rest: {drawn[:, 1].max():.0f} points; memory of the server {memory:.0f} MB; load {load:.1f}"
+        )
         browser.close()
         server.should_exit = True
     viewer.stop()

@@ -103,31 +103,29 @@ def mapped(browser: Any, server: Server, video: Path) -> Path:
     return next(runs.path(name) for name in runs.names() if runs.record(name).title == video.name)
 
 
-# The pixels at which vertices of a node of the scene are seen, and their number.
+# The pixels at which every `step`-th vertex of a node of the scene is seen.
 PLACES = """([name, step]) => {
-  const {scene, camera, canvas} = window.__viserMutable, found = [], box = canvas.getBoundingClientRect();
-  let count = 0;
-  scene.traverse((node) => {
-    if (!node.geometry?.attributes.position || !node.parent?.parent?.name?.includes(name)) return;
-    const {array} = node.geometry.attributes.position;
-    for (let at = 0; at < array.length; at += 3 * step, count++) {
+  const {nodeRefFromName, camera, canvas} = window.__viserMutable ?? {}, found = [];
+  const box = canvas?.getBoundingClientRect();
+  nodeRefFromName?.["/" + name]?.traverse((node) => {
+    const array = node.geometry?.attributes.position?.array ?? [];
+    for (let at = 0; at < array.length; at += 3 * step) {
       const seen = node.localToWorld(camera.position.clone().set(...array.slice(at, at + 3))).project(camera);
       found.push([box.left + box.width * (1 + seen.x) / 2, box.top + box.height * (1 - seen.y) / 2]);
     }
   });
-  return [count, found];
+  return found;
 }"""
 
 
 def places(page: Any, name: str, step: int = 1) -> list[tuple[float, float]]:
     """Where the vertices of a node are seen beside the panel, which is 390 wide; those in the middle first."""
-    _, found = page.evaluate(PLACES, [name, step])
-    inside = [(x, y) for x, y in found if 20 < x < 850 and 20 < y < 780]
+    inside = [(x, y) for x, y in page.evaluate(PLACES, [name, step]) if 20 < x < 850 and 20 < y < 780]
     return sorted(inside, key=lambda at: abs(at[0] - 440) + abs(at[1] - 400))
 
 
 def count(page: Any, name: str) -> int:
-    return int(page.evaluate(PLACES, [name, 1])[0])
+    return len(page.evaluate(PLACES, [name, 1]))
 
 
 def test_a_length_is_measured_and_a_colmap_model_is_taken_away(
@@ -163,18 +161,21 @@ def test_a_length_is_measured_and_a_colmap_model_is_taken_away(
     assert not [each for each in server.folder.parent.rglob("*") if "<img" in each.name]
 
 
-CAMERA = "() => { const {position, up} = window.__viserMutable.camera; return [...position, ...up]; }"
+EYE = "window.__viserMutable.camera.position.toArray()"
+TURN = """(({nodeRefFromName, camera}) =>
+  nodeRefFromName["/points"].getWorldQuaternion(camera.quaternion.clone()).toArray())(window.__viserMutable)"""
 
 
 def test_a_result_is_cropped_played_set_up_and_compared(page: Any, mapped: Path, video: Path) -> None:
     wait_until(lambda: count(page, "points") > 50)
+    open_tab(page, "Result")
     page.locator('input[data-kind="truth"]').set_input_files(video.with_name("truth.txt"))
     page.get_by_text(re.compile(r"ATE 0\.0\d* m RMSE")).wait_for(timeout=SLOW_MS)
     assert count(page, "other") > 1000
 
-    before = page.evaluate(CAMERA)
+    before = page.evaluate(EYE)
     page.get_by_role("button", name="Play the path").click()
-    wait_until(lambda: page.evaluate(CAMERA)[:3] != before[:3], 30)
+    wait_until(lambda: page.evaluate(EYE) != before, 30)
     page.get_by_role("button", name="Play the path").click()
     page.reload()  # from where all is seen
     page.get_by_role("tab", name="Measure").click()
@@ -187,14 +188,22 @@ def test_a_result_is_cropped_played_set_up_and_compared(page: Any, mapped: Path,
     open_tab(page, "Measure")
     page.get_by_role("button", name="set up").click()
     page.get_by_text("Click a floor or a table.").wait_for()
+    before = page.evaluate(TURN)
     page.mouse.click(*places(page, "points")[0])
-    wait_until(lambda: page.evaluate(CAMERA)[3:] != before[3:], 30)
+    wait_until(lambda: page.evaluate(TURN) != before, 30)
 
     whole = count(page, "points")
-    thumb = page.get_by_role("slider").first
-    for _ in range(3):
-        thumb.press("PageUp")
-    wait_until(lambda: 0 < count(page, "points") < whole, 30)
+    box = page.locator(".multi-slider-track-container").first.bounding_box()
+    y = box["y"] + box["height"] / 2
+    page.mouse.move(box["x"] + 1, y)
+    page.mouse.down()
+
+    def is_cropped() -> bool:
+        page.mouse.move(box["x"] + 0.45 * box["width"], y, steps=3)
+        return 0 < count(page, "points") < whole
+
+    wait_until(is_cropped, 30)
+    page.mouse.up()
 
 
 @pytest.mark.slow  # a minute: the whole demo

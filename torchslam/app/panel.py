@@ -82,7 +82,7 @@ class Panel:
         elif kind in FILE_KINDS:
             self._options.take(kind, path.rename(path.with_name(f"{kind}{path.suffix}")))
         elif kind == "truth":
-            self._compare_with(path, called, is_truth=True)
+            self._compare(path, called, is_truth=True)
         else:
             raise ResultsError("no such kind of upload")
 
@@ -105,7 +105,7 @@ class Panel:
         self._button("Play the path", lambda _: self._toggle_play(), color="gray")
         self._keyframe = self._gui.add_image(EMPTY, visible=False)
         self._other = self._gui.add_dropdown("Compare with", (NONE,))
-        self._button("Compare", lambda _: self._compare(str(self._other.value)), color="gray")
+        self._button("Compare", lambda _: self._compare_run(str(self._other.value)), color="gray")
         self._gui.add_html(file_button("Compare with a true path (TUM)", "truth"))
         self._comparison = self._gui.add_html("")
 
@@ -182,11 +182,10 @@ class Panel:
         if self._is_playing:
             threading.Thread(target=play, daemon=True).start()
 
-    def _compare(self, name: str) -> None:
-        path = self._runs.path(name) / TRAJECTORY
-        self._compare_with(path, self._runs.record(name).title, is_truth=False)
+    def _compare_run(self, name: str) -> None:
+        self._compare(self._runs.path(name) / TRAJECTORY, self._runs.record(name).title, is_truth=False)
 
-    def _compare_with(self, path: Path, title: str, is_truth: bool) -> None:
+    def _compare(self, path: Path, title: str, is_truth: bool) -> None:
         if not self._scene.submap:
             raise ResultsError("open a result first")
         shown, S = self._runs.path(self._shown), self._scene.submap["S_shown_map"]
@@ -281,14 +280,10 @@ class Panel:
         self._runs.advance()
         names, rows = self._runs.names(), list[str]()
         for name in names:
-            title, state, took = (
-                self._runs.record(name).title,
-                self._runs.state(name),
-                self._runs.seconds(name),
-            )
+            state, took = self._runs.state(name), self._runs.seconds(name)
             image = f'<img src="/runs/{quote(name, safe="")}/picture" alt="" style="{PICTURE}">'
-            words = f"<b>{html.escape(title)}</b><br>{html.escape(name)}<br>{state.value}"
-            words += f", {took:.0f} s" if took else ""
+            words = f"<b>{html.escape(self._runs.record(name).title)}</b><br>{html.escape(name)}<br>"
+            words += state.value + (f", {took:.0f} s" if took else "")
             rows.append(f'<div style="{ROW}">{image if state is State.DONE else ""}<div>{words}</div></div>')
         change(self._list, "content", "".join(rows) or line_of("No runs yet."))
         change(self._chosen, "options", (NONE, *names))

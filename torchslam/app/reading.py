@@ -51,9 +51,8 @@ class ReadingProcess:
             except (BrokenProcessPool, TooLate):
                 self.close()
                 self._pool = self._start()
-        raise ResultsError(
-            f"{folder.name}: reading it ended its process, or took {PATIENCE_S:g} s: damaged files?"
-        )
+        words = f"reading it ended its process, or took {PATIENCE_S:g} s: damaged files?"
+        raise ResultsError(f"{folder.name}: {words}")
 
     def close(self) -> None:
         """End the process, whatever it does."""
@@ -135,11 +134,9 @@ def live(folder: Path, words: tuple[str, ...], shown: int) -> dict[str, Any] | N
         watched.image(each)
     drawn = watched.image(frame).copy()
     found["colors"] = watched.colors(found["seen_frame"], found["seen_pixel"], width)
-    for pixels, color, radius in (
-        (found["keypoints"], UNSEEN, 1),
-        (found["tracked"], COLORS[State(str(found["state"]))][::-1], 2),
-    ):
-        draw_keypoints(drawn, pixels * (drawn.shape[1] / width), color, radius)
+    scale, color = drawn.shape[1] / width, COLORS[State(str(found["state"]))][::-1]
+    draw_keypoints(drawn, found["keypoints"] * scale, UNSEEN, 1)
+    draw_keypoints(drawn, found["tracked"] * scale, color, 2)
     return found | {"image": drawn}
 
 

@@ -41,7 +41,7 @@ class Scene:
     def show_live(self, found: dict[str, Any]) -> None:
         """Draw a map that grows, as of `reading.live`. Its world is that of the first camera: y points down."""
         poses, points = found["poses"], found["points"]
-        if not len(points):
+        if not len(points) or not len(poses):
             return
         low, high = np.percentile(points, (5, 95), axis=0)
         self._size = max(float(np.linalg.norm(high - low)), MIN_SIZE)
@@ -121,7 +121,7 @@ class Scene:
             camera.position, camera.look_at = position, np.asarray(center)
 
     def _cloud(self, name: str, points: np.ndarray, colors: np.ndarray, size: float) -> None:
-        """Draw points in random order, as page.js wants them; their size is relative to that of the scene."""
+        """Draw points in random order, as detail.js wants them; their size is relative to that of the scene."""
         if len(points):
             order = self._random.permutation(len(points))
             style: dict[str, Any] = {"precision": "float32", "point_shape": "square", "point_shading": "flat"}

@@ -1,18 +1,23 @@
 /* Levels of detail, of view.html and of `torchslam app`.
  *
  * Large clouds, and frusta as a mesh of lines, come in random order. While the view moves, only a first part of them is
- * drawn, as much as the renderer draws at 20 frames a second; at rest ten times as much: without a GPU half a second's.
+ * drawn, as much as the renderer draws at 20 frames a second; at rest 15 times as much, which takes below a second.
  */
 const detail = { rested() {} }; // called when the view rests and its last frame was not drawn in full
 (() => {
   const gl = WebGL2RenderingContext.prototype;
-  const [FRAME_MS, AT_REST, IDLE, LEAST] = [45, 10, 10, 6000]; // times as many points; frames; points
+  const [FRAME_MS, AT_REST, IDLE, BURST, STILL_MS, LEAST] = [45, 15, 10, 5, 500, 20000]; // the last in points
   const FRUSTUM = { vertices: 24, points: 200 }; // of its lines; points that take as long
-  let [limit, largest, isResting, isCut, drawn, idle, before] = [20000, 0, false, false, 0, 0, -1];
+  let [limit, largest, isResting, isCut, drawn, idle, before, touched] = [40000, 0, false, false, 0, 0, -1, -Infinity];
+  const isStill = (now) => drawn < BURST && now - touched > STILL_MS;
+
+  for (const name of ["pointerdown", "pointermove", "wheel", "keydown"])
+    addEventListener(name, ({ type, buttons }) => (touched = type !== "pointermove" || buttons ? performance.now() : touched), true);
 
   function allowed(mode, count) {
     if (before < 0) {
-      [isResting, before] = [true, performance.now()]; // the first frame after a pause
+      before = performance.now(); // the first frame after a pause
+      isResting = isStill(before);
       requestAnimationFrame(look);
     }
     const isPoints = mode === gl.POINTS;
@@ -26,15 +31,16 @@ const detail = { rested() {} }; // called when the view rests and its last frame
 
   /** Before each refresh of the screen, from the first frame that is drawn to some time after the last one. */
   function look(now) {
-    if (largest && drawn > 2) {
+    if (largest && !isResting && drawn > 2) {
       // The frames before wait for what was drawn in the pause.
       const factor = Math.max(0.5, Math.min(1.15, Math.sqrt(FRAME_MS / (now - before))));
       if (factor < 1 || largest > limit) limit = Math.max(LEAST, Math.min(limit, largest) * factor);
     }
-    [drawn, idle, isResting] = largest ? [drawn + 1, 0, false] : [drawn, idle + 1, isResting];
-    [largest, before] = [0, now];
-    if (idle < IDLE) return requestAnimationFrame(look);
-    [drawn, idle, before] = [0, 0, -1];
+    idle = largest ? 0 : idle + 1;
+    drawn = largest ? drawn + 1 : idle < IDLE ? drawn : 0;
+    [largest, before, isResting] = [0, now, isStill(now)];
+    if (idle < IDLE || now - touched <= STILL_MS) return requestAnimationFrame(look);
+    before = -1;
     if (isCut) detail.rested();
     isCut = false;
   }
