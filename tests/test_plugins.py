@@ -18,12 +18,15 @@ from torch import Tensor
 from torchslam import ORB, SLAM, ClipSLAM, Config, Features, load_config, open_sequence, plugins
 from torchslam.cli.main import main
 from torchslam.errors import ConfigError
+from torchslam.map.atlas import MAX_MOTIONS
 from torchslam.system.front_end import image_extractor
 from torchslam.tracking.learned_matchers import LightGlue
 from torchslam.tracking.matcher import make_matcher
-from torchslam.types import Frame, FrameFeatures
+from torchslam.tracking.motion_model import constant_velocity, run_motion_model
+from torchslam.types import Frame, FrameFeatures, MotionHistory, PosePrediction
 
 EXAMPLE = Path(__file__).parent.parent / "examples" / "own_front_end.py"
+EYE = torch.eye(4)
 ROOM = "synthetic:room?frames=14"
 HERE = "tests.test_plugins"
 
@@ -272,3 +275,47 @@ def test_samples_keep_their_identity_along_the_flow() -> None:
     moved = other.keypoints[found.indices_2[found.mask]] - one.keypoints[found.indices_1[found.mask]]
     assert 0 < float(moved.norm(dim=-1).median()) < 20
     assert len(torch.unique(found.indices_2[found.mask])) == int(found.mask.sum())
+
+
+@pytest.mark.usefixtures("without_pictures")
+def test_a_motion_model_runs_from_the_command_line(tmp_path: Path) -> None:
+    names = ["--motion-model", "examples.own_motion_model:steady", "--set", "features.num_keypoints=500"]
+    assert main(["run", ROOM, "-o", str(tmp_path), *names]) == 0
+    metrics = json.loads((tmp_path / "metrics.json").read_text())
+    assert metrics["posed"] == 14
+    assert metrics["ate_m"] < 0.05
+    assert "own_motion_model:steady" in (tmp_path / "config.toml").read_text()
+
+
+def test_the_default_motion_model_as_a_plugin_gives_the_same_bytes() -> None:
+    room, config = open_sequence(ROOM), load_config(None, ["features.num_keypoints=500"])
+    histories: list[MotionHistory] = []
+
+    def own(history: MotionHistory) -> PosePrediction:
+        histories.append(history)
+        return constant_velocity(history)
+
+    found = SLAM(room.camera, config, motion_model=own).run(room)
+    assert torch.equal(found.trajectory.T_wc, SLAM(room.camera, config).run(room).trajectory.T_wc)
+    longest = max(histories, key=lambda history: len(history.motions))
+    assert 5 < len(longest.motions) == len(longest.intervals) <= MAX_MOTIONS
+    assert longest.interval == pytest.approx(room.timestamp(1) - room.timestamp(0), abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("found", "words"),
+    [
+        (None, "must return PosePrediction, not NoneType"),
+        ([EYE[:3, :3]], r"T_cw must be a \(4, 4\) rigid transform"),
+        ([2 * EYE], r"T_cw must be a \(4, 4\) rigid transform"),
+        ([torch.nan * EYE], r"T_cw must be a \(4, 4\) rigid transform"),
+        ([EYE, EYE], "covariance must be a finite, symmetric"),
+        ([EYE, torch.full((6, 6), torch.inf)], "covariance must be a finite, symmetric"),
+        ([EYE, torch.eye(6) - torch.ones(6, 6)], "covariance must be positive semi-definite"),
+    ],
+)
+@pytest.mark.usefixtures("without_shape_checks")
+def test_an_invalid_prediction_is_named(found: Any, words: str) -> None:
+    eye, found = EYE.double(), None if found is None else PosePrediction(*found)
+    with pytest.raises(ConfigError, match=f"motion model <lambda>: .*{words}"):
+        run_motion_model(lambda _: found, MotionHistory(eye, eye[None], torch.ones(1).double(), 1.0))

@@ -24,6 +24,7 @@ from torchslam.errors import ConfigError
 
 FEATURE_EXTRACTORS = "torchslam.front_ends"
 MATCHERS = "torchslam.matchers"
+MOTION_MODELS = "torchslam.motion_models"
 KORNIA, KORNIA_FEATURES = "kornia:", "kornia.feature:"
 """kornia:DISK is kornia.feature.DISK."""
 ALLOWED = "TORCHSLAM_PLUGINS"

@@ -250,6 +250,41 @@ for projected map points."""
 
 
 @dataclass(frozen=True)
+class MotionHistory:
+    """The last poses in a submap, from which a motion model predicts the next one.
+
+    Attributes:
+        T_cw: pose of the last frame, world to camera, in the unit of the map.
+        motions: T_c_previous of up to ten frames, the newest at the end; none after a start or a lost frame.
+        intervals: seconds that each motion takes, negative backward in time; 0 if unknown.
+        interval: seconds from the last frame to the next one; 0 if unknown.
+    """
+
+    T_cw: Float[Tensor, "4 4"]
+    motions: Float[Tensor, "M 4 4"]
+    intervals: Float[Tensor, " M"]
+    interval: float
+
+
+@dataclass(frozen=True)
+class PosePrediction:
+    """The pose that is expected of a frame.
+
+    Attributes:
+        T_cw: world to camera.
+        covariance: of T_cw, left perturbation, translation first, in the unit of the map and radians: keypoints are
+            searched for where it allows, and a pose that it excludes has to be confirmed; None: fixed limits.
+    """
+
+    T_cw: Float[Tensor, "4 4"]
+    covariance: Float[Tensor, "6 6"] | None = None
+
+
+MotionModel = Callable[[MotionHistory], PosePrediction]
+"""Predicts a pose. It keeps no state: a checkpoint has the history, and tracking also goes backward in time."""
+
+
+@dataclass(frozen=True)
 class MatchIndices:
     """Rows of matches in two sets, and their weights; None: equal weights."""
 

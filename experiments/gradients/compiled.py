@@ -2,7 +2,8 @@
 
     python -m experiments.gradients.compiled [--output FILE]
 
-Needs a compiler of C++. Medians of CPU time of one thread, float64. Prints a table and writes it to FILE.
+Needs a compiler of C++. Medians of CPU time of one thread, float64. Prints a table and writes it to FILE
+and into docs/gradients.md, without --no-page.
 """
 
 from __future__ import annotations
@@ -14,11 +15,12 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from experiments.common import milliseconds, parser_of, publish_page, table, timed
+from experiments.common import milliseconds, parser_of, publish_page, table, timed, write_between
 from torchslam.geometry import Camera, se3_exp, transform
 from torchslam.optim import solve_pose
 
 HERE = Path(__file__).parent
+GRADIENTS = HERE.parents[1] / "docs" / "gradients.md"
 CAMERA = Camera.pinhole(500.0, 500.0, 319.5, 239.5, size=(640, 480))
 POINTS, REPEATS = 1000, 15
 
@@ -48,7 +50,9 @@ def row(what: str, function: Callable[..., Tensor], inputs: tuple[Tensor, ...], 
 
 
 def main() -> None:
-    arguments = parser_of(__doc__, HERE / "compiled.md").parse_args()
+    parser = parser_of(__doc__, HERE / "compiled.md")
+    parser.add_argument("--no-page", action="store_true", help="leave docs/gradients.md as it is")
+    arguments = parser.parse_args()
     torch.set_num_threads(1)
     generator = torch.Generator().manual_seed(0)
     rows = []
@@ -67,9 +71,10 @@ def main() -> None:
     text = (
         "CPU milliseconds, medians, one thread, float64.\n\n    python -m experiments.gradients.compiled\n\n"
     )
-    publish_page(
-        "What torch.compile saves", text + table("what | plain | compiled | first call, s", rows), arguments
-    )
+    found = table("what | plain | compiled | first call, s", rows)
+    publish_page("What torch.compile saves", text + found, arguments)
+    if not arguments.no_page:
+        write_between(GRADIENTS, found)
 
 
 if __name__ == "__main__":

@@ -89,12 +89,8 @@ def test_a_transform_changes_no_reprojection(submap: Submap) -> None:
 def test_tracking_continues_after_a_transform(submap: Submap) -> None:
     before = copy.deepcopy(submap)
     submap.transform(similarity())
-    assert before.tracking.velocity is not None
-    assert submap.tracking.velocity is not None
-    predicted = submap.tracking.velocity @ submap.T_cw
-    torch.testing.assert_close(
-        predicted, moved_poses((before.tracking.velocity @ before.T_cw)[None], similarity())[0]
-    )
+    predicted = submap.tracking.motions @ submap.T_cw
+    torch.testing.assert_close(predicted, moved_poses(before.tracking.motions @ before.T_cw, similarity()))
 
 
 def corrections(submap: Submap) -> Tensor:
@@ -128,9 +124,8 @@ def test_corrected_frames_see_points_of_their_keyframe_as_before(submap: Submap)
         torch.testing.assert_close(points_c, expected)
     around = scale[submap.tracking.reference]
     torch.testing.assert_close(submap.tracking.T_cr[:3, 3], before.tracking.T_cr[:3, 3] / around)
-    assert submap.tracking.velocity is not None
-    assert before.tracking.velocity is not None
-    torch.testing.assert_close(submap.tracking.velocity[:3, 3], before.tracking.velocity[:3, 3] / around)
+    moved, old = submap.tracking.motions[..., :3, 3], before.tracking.motions[..., :3, 3]
+    torch.testing.assert_close(moved, old / around)
 
 
 def test_corrected_covariances_keep_their_size_in_pixels(submap: Submap) -> None:

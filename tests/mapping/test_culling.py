@@ -44,7 +44,9 @@ def world_of(T_cw: Tensor, scales: list[float] | None = None) -> Submap:
         submap.posed_frames.add(view, seen, pose @ se3_inverse(pose), keyframe)
     last = len(T_cw) - 1
     eye = torch.eye(4, dtype=torch.float64)
-    submap.tracking = TrackingState(eye, last, POINTS, None, everyone, slam_map.index_tensor(last), everyone)
+    no_motion = torch.empty(0, 4, 4), torch.empty(0)
+    rows = everyone, slam_map.index_tensor(last), everyone
+    submap.tracking = TrackingState(eye, last, POINTS, *no_motion, *rows)
     return submap
 
 

@@ -137,7 +137,7 @@ def test_a_rollback_restores_every_byte_of_the_map_and_the_tracking_state() -> N
     savepoint.save_map()
     before = state_of(submap)
     noise_variance = submap.map.noise_variance
-    tracker.commit(submap, view, None)  # forgets the velocity in place
+    tracker.commit(submap, view, None)  # forgets the motions
     tracker.reset_to_keyframe(submap, mapper.insert(submap.map, view, estimate))
     assert list(savepoint.keyframes) == [3]
     submap.map.noise_variance = 7.0

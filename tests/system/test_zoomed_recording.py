@@ -88,7 +88,8 @@ def test_results_state_the_zoom_and_exports_have_images_without_it(
     inside = torchslam.open_sequence(folder).unzoomed(saved.zoom).mask(frame)
     assert inside is not None
     found, as_taken = (
-        float((source.image(frame) - room().image(frame))[inside].abs().mean()) for source in (images, sequence)
+        float((source.image(frame) - room().image(frame))[inside].abs().mean())
+        for source in (images, sequence)
     )
     assert found < 0.4 * as_taken
     (tmp_path / "metrics.json").write_text((tmp_path / "metrics.json").read_text().replace('"ratios"', '"x"'))

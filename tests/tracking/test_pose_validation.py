@@ -27,7 +27,7 @@ from torchslam.tracking.pose_validation import (
     deviations,
     jump,
 )
-from torchslam.types import PoseEstimate, Reason, Rejection
+from torchslam.types import PoseEstimate, PosePrediction, Reason, Rejection
 
 HERE = pose(0.3, -0.2, 0.1, 0.2, 0.1, -0.3)
 
@@ -40,7 +40,7 @@ def verdict(
     estimate: PoseEstimate, expected: Tensor | None = None, error: float = 0.9, explained_ratio: float = 1.0
 ) -> Verdict:
     averages = replace(TrackingState.empty(HERE), error=error, explained_ratio=explained_ratio)
-    return check_pose(estimate, expected, averages)
+    return check_pose(estimate, None if expected is None else PosePrediction(expected), averages)
 
 
 def doubt(estimate: PoseEstimate, expected: Tensor | None = None, **averages: float) -> str:
@@ -169,3 +169,13 @@ def test_a_pose_that_is_wrong_by_itself_is_not_compared_with_the_map() -> None:
     assert found.rejection is not None
     assert found.rejection.reason is Reason.LOW_INLIER_RATIO
     assert verdict(seen(coverage_ratio=0.0), FAR, error=9.0).is_jump
+
+
+def test_a_prediction_with_a_covariance_says_what_a_jump_is() -> None:
+    """Off by 0.1 of the depth and by 30 degrees: odd where that is six and more deviations, plausible within three."""
+    averages = replace(TrackingState.empty(HERE), error=0.9, explained_ratio=1.0)
+    for off in (pose(0.1), pose(0, 0, 0, 0, 0.5, 0)):
+        for std, is_jump in ((0.01, True), (0.3, False)):
+            covariance = std**2 * torch.eye(6, dtype=torch.float64)
+            found = check_pose(seen(depth=1.0), PosePrediction(off @ HERE, covariance), averages)
+            assert found.is_jump == is_jump

@@ -39,10 +39,11 @@ from torchslam.tracking.data_association import (
     subsample_per_cell,
 )
 from torchslam.tracking.localizer import Projected, project_points
-from torchslam.tracking.tracker import Tracker, well_observed
-from torchslam.types import FrameFeatures, PoseEstimate
+from torchslam.tracking.tracker import SEARCH_RADIUS_PX, Tracker, well_observed
+from torchslam.types import FrameFeatures, PoseEstimate, PosePrediction
 
 SCENE = Scene.of(300)
+EMPTY = torch.empty(0, dtype=torch.float64)
 ROWS = rows_of(SCENE)
 STEP = torch.tensor([-0.05, 0.02, 0.03, 0.01, 0.04, -0.02], dtype=torch.float64)  # from frame to frame
 AWAY = pose(0, 0, 0, 0, 3.0)
@@ -69,13 +70,13 @@ def followed(where: Submap, view: FrameFeatures, by: Tracker | None = None) -> P
 
 def test_tracking_continues_from_a_keyframe() -> None:
     here = submap(4)
-    here.tracking.velocity, here.tracking.error, here.tracking.explained_ratio = pose(0.1), 0.7, 0.4
+    here.tracking = replace(here.tracking.moved(pose(0.1), 0.0), error=0.7, explained_ratio=0.4)
     tracker().reset_to_keyframe(here, 2)
     tracking = here.tracking
     assert tracking.reference == 2
     torch.testing.assert_close(tracking.T_cr, pose())
     torch.testing.assert_close(here.T_cw, here.map.T_cw[2])
-    assert torch.equal(tracking.velocity, pose(0.1))
+    assert torch.equal(tracking.motions, pose(0.1)[None])
     assert (tracking.error, tracking.explained_ratio) == (0.7, 0.4)
     assert int(tracking.local_keyframes[0]) == 2
     assert sorted(tracking.local_keyframes.tolist()) == [0, 1, 2, 3]
@@ -114,28 +115,29 @@ def test_a_prediction_repeats_the_last_motion() -> None:
     path = [first, se3_exp(STEP) @ first, se3_exp(STEP) @ se3_exp(STEP) @ first]
     for index, T_cw in enumerate(path[:2]):
         followed(here, SCENE.view(50 + index, T_cw), follower)
-    torch.testing.assert_close(here.tracking.velocity, se3_exp(STEP), atol=1e-7, rtol=0)
-    torch.testing.assert_close(follower.predict(here), path[2], atol=1e-7, rtol=0)
+    torch.testing.assert_close(here.tracking.motions[-1], se3_exp(STEP), atol=1e-7, rtol=0)
+    torch.testing.assert_close(follower.predict(here, 60.0).T_cw, path[2], atol=1e-7, rtol=0)
     torch.testing.assert_close(here.T_cw, path[1], atol=1e-7, rtol=0)
-    torch.testing.assert_close(tracker("paper.brute_force=true").predict(here), here.T_cw)
-    here.tracking.velocity = None
-    torch.testing.assert_close(follower.predict(here), here.T_cw)
+    for still in ("paper.brute_force=true", "tracking.motion_model=constant-pose"):
+        torch.testing.assert_close(tracker(still).predict(here, 60.0).T_cw, here.T_cw)
+    here.tracking = here.tracking.without_motion()
+    torch.testing.assert_close(follower.predict(here, 60.0).T_cw, here.T_cw)
 
 
 def test_a_lost_frame_resets_the_motion_model() -> None:
     here = submap()
-    here.tracking.velocity = pose(0.1)
+    here.tracking = here.tracking.moved(pose(0.1), 0.0)
     before, view, follower = state_of(here), SCENE.view(50, AWAY), tracker()
     assert follower.track(here, view) is None
     follower.commit(here, view, None)
-    assert_same_state(state_of(here), before | {"velocity": None})
+    assert_same_state(state_of(here), before | {"motions": EMPTY.view(0, 4, 4), "intervals": EMPTY})
 
 
 @pytest.mark.parametrize("T_cw", [se3_exp(3 * STEP), AWAY], ids=["found", "lost"])
 @pytest.mark.parametrize("is_sure", [True, False])
 def test_estimating_a_pose_changes_neither_map_nor_tracking_state(T_cw: Tensor, is_sure: bool) -> None:
     here, view, follower = submap(), SCENE.view(50, T_cw, noise=0.5), tracker()
-    here.tracking.velocity = se3_exp(STEP)
+    here.tracking = here.tracking.moved(se3_exp(STEP), 0.0)
     before, posed = state_of(here), len(here.posed_frames)
     estimate = follower.track(here, view, is_sure=is_sure)
     assert (estimate is None) is (T_cw is AWAY)
@@ -155,9 +157,9 @@ def test_matches_are_searched_around_the_prior_pose_if_there_is_one() -> None:
     T_cw = sideways(1, start=0.2)[0]
     view = SCENE.view(50, T_cw)
     view = replace(view, descriptors=view.descriptors ^ torch.eye(32, dtype=torch.uint8)[0] * 255)
-    here.tracking.T_cr, here.tracking.velocity = AWAY, None
+    here.tracking.T_cr = AWAY
     assert follower.track(here, view) is None
-    estimate = follower.track(here, view, prior_T_cw=T_cw)
+    estimate = follower.track(here, view, PosePrediction(T_cw))
     assert estimate is not None
     torch.testing.assert_close(estimate.T_cw, T_cw, atol=1e-7, rtol=0)
 
@@ -176,7 +178,7 @@ def test_the_reference_keyframe_shares_the_most_points() -> None:
         here.tracking.T_cr, T_cw @ se3_inverse(here.map.T_cw[here.tracking.reference]), atol=1e-7, rtol=0
     )
     assert torch.equal(here.tracking.last_inlier_points, estimate.point_ids)
-    assert here.tracking.velocity is not None
+    assert len(here.tracking.motions)
     last_seen = here.map.points["last_seen_frame"]
     assert (last_seen[estimate.point_ids] == 50).all()
     others = torch.ones(len(last_seen), dtype=torch.bool).index_fill(0, estimate.point_ids, False)
@@ -194,7 +196,7 @@ def test_running_averages_span_about_ten_frames() -> None:
 
 def test_the_tracking_state_restarts_after_relocalization() -> None:
     here, follower = submap(5), tracker()
-    here.tracking.velocity, here.tracking.error, here.tracking.explained_ratio = pose(0.1), 3.0, 0.1
+    here.tracking = replace(here.tracking.moved(pose(0.1), 0.0), error=3.0, explained_ratio=0.1)
     view = SCENE.view(50, sideways(1, start=0.02)[0])
     estimate = followed(here.fork(), view, follower)
     here.map.points["last_seen_frame"][:] = 0
@@ -202,7 +204,7 @@ def test_the_tracking_state_restarts_after_relocalization() -> None:
     follower.start_at_estimate(here, view, estimate)
     assert here.world != before
     assert here.tracking.reference == 0
-    assert here.tracking.velocity is None
+    assert not len(here.tracking.motions)
     assert (here.tracking.error, here.tracking.explained_ratio) == (0.0, 1.0)
     assert torch.equal(here.tracking.last_inlier_points, estimate.point_ids)
     torch.testing.assert_close(here.T_cw, estimate.T_cw)
@@ -293,7 +295,7 @@ def located(here: Submap, view: FrameFeatures, T_cw: Tensor) -> PoseEstimate | N
     """Track a view from a prediction."""
     aside = here.fork()
     aside.tracking.T_cr = T_cw @ se3_inverse(here.map.T_cw[here.tracking.reference])
-    aside.tracking.velocity = None
+    aside.tracking = aside.tracking.without_motion()
     other = view.descriptors.clone()
     other[:, 0] ^= 255  # eight bits of noise: no nearest neighbor is a billion times nearer than the second
     return tracker("matching.max_ratio=1e-9").track(aside, replace(view, descriptors=other))
@@ -316,7 +318,7 @@ def test_without_a_prediction_matching_is_by_descriptor() -> None:
     here = submap(3)
     T_cw = sideways(1, start=0.2)[0]
     here.tracking.T_cr = AWAY
-    here.tracking.velocity = None
+    here.tracking = here.tracking.without_motion()
     estimate = followed(here, SCENE.view(50, T_cw))
     torch.testing.assert_close(estimate.T_cw, T_cw, atol=1e-7, rtol=0)
 
@@ -492,3 +494,19 @@ def test_after_uncertain_frames_the_pose_search_starts_from_scratch(monkeypatch:
         aside = here.fork()
         assert follower.track(aside, view, is_sure=is_sure) is not None
         assert calls == wanted
+
+
+def test_keypoints_are_searched_for_where_a_covariance_allows() -> None:
+    """A frame far from its prediction, at first found by a model that states how wrong it is."""
+    here, view = submap(), SCENE.view(50, se3_exp(3 * STEP) @ submap().T_cw)
+    radii = []
+    for std in (None, 1e-4, 0.05):
+        covariance = None if std is None else std**2 * torch.eye(6, dtype=torch.float64)
+        prediction = PosePrediction(here.T_cw, covariance)
+        follower = tracker()
+        near = follower.localizer.project(here.map, here.tracking.local_points, here.T_cw, view)
+        radii.append(follower._search_radius(here.map, near, prediction))
+        assert follower.track(here, view, prediction) is not None
+    assert radii[0] == SEARCH_RADIUS_PX
+    assert float(radii[1].max()) < 6
+    assert float(radii[2].min()) > SEARCH_RADIUS_PX

@@ -165,6 +165,12 @@ def add_named_settings(parser: argparse.ArgumentParser) -> argparse._ArgumentGro
         metavar="NAME",
         help="matcher (matching.matcher): descriptors, lightglue, kornia:NAME, a plugin, or PACKAGE:NAME",
     )
+    features.add_argument(
+        "--motion-model",
+        metavar="NAME",
+        help=f"predicts poses (tracking.motion_model): {', '.join(CHOICES['tracking.motion_model'])}, a plugin, or "
+        "PACKAGE:NAME",
+    )
     camera = parser.add_argument_group("error of the given camera")
     camera.add_argument(
         "--camera-std",
@@ -195,6 +201,7 @@ def config(options: argparse.Namespace) -> Config:
 def overrides(options: argparse.Namespace) -> list[str]:
     """Return the changes that the arguments of `add_config` make to the file, as `section.key=value`."""
     named = {"features.kind": options.features, "features.weights": options.weights}
+    named |= {"tracking.motion_model": options.motion_model}
     named |= {"matching.matcher": options.matcher, "camera.std": options.camera_std}
     named |= {"scale": options.scale, "seed": options.seed}
     if options.readout != AUTO:

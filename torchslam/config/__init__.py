@@ -22,6 +22,7 @@ from torchslam.config.sections import (
     MetricConfig,
     PaperConfig,
     SimulatedConfig,
+    TrackingConfig,
 )
 from torchslam.errors import ConfigError
 
@@ -39,6 +40,7 @@ __all__ = [
     "MetricConfig",
     "PaperConfig",
     "SimulatedConfig",
+    "TrackingConfig",
     "load_config",
     "to_toml",
 ]
@@ -63,6 +65,7 @@ class Config(Settings):
     simulated: SimulatedConfig = field(default_factory=SimulatedConfig)
     matching: MatchingConfig = field(default_factory=MatchingConfig)
     initialization: InitializationConfig = field(default_factory=InitializationConfig)
+    tracking: TrackingConfig = field(default_factory=TrackingConfig)
     keyframes: KeyframesConfig = field(default_factory=KeyframesConfig)
     loop_closing: LoopClosingConfig = field(default_factory=LoopClosingConfig)
     global_mapping: GlobalMappingConfig = field(default_factory=GlobalMappingConfig)

@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass
 
 from torchslam.config.schema import Settings, setting
-from torchslam.plugins import FEATURE_EXTRACTORS, MATCHERS
+from torchslam.plugins import FEATURE_EXTRACTORS, MATCHERS, MOTION_MODELS
 
 MAX_NUMBER = 1_000_000
 """Upper bound of counts, ratios and factors without a natural limit; far beyond the value that disables a test."""
@@ -122,6 +122,19 @@ class InitializationConfig(Settings, section="initialization"):
 
     min_matches: int = setting(100, low=1, high=MAX_NUMBER)
     min_planar_frames: int = setting(10, high=MAX_NUMBER)
+
+
+@dataclass(frozen=True)
+class TrackingConfig(Settings, section="tracking"):
+    """Tracking of frames in the map.
+
+    Attributes:
+        motion_model: Model that predicts the pose of a frame from those before it.
+    """
+
+    motion_model: str = setting(
+        "constant-velocity", choices=("constant-velocity", "constant-pose"), group=MOTION_MODELS
+    )
 
 
 @dataclass(frozen=True)

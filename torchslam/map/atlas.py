@@ -26,6 +26,9 @@ EMA_RATE = 0.1
 """Weight of the newest frame in the moving averages of the tracking state: about the last ten frames count. Tried at
 this value only."""
 
+MAX_MOTIONS = 10
+"""Motions that are kept for a motion model: a third of a second of video. Tried at this value only."""
+
 
 @dataclass
 class TrackingState:
@@ -35,34 +38,52 @@ class TrackingState:
         T_cr: Pose of the last frame relative to its reference keyframe, so that it follows the map.
         reference: Row of the reference keyframe; -1 before there is one.
         reference_size: Number of points of the reference keyframe that other keyframes observe as well.
-        velocity: Last motion, T_c_previous; None if unknown.
+        motions: The last motions, T_c_previous, the newest at the end, at most `MAX_MOTIONS`; none if unknown.
         last_inlier_points: Points that the last frame observed.
         local_keyframes: Keyframes of the local map: the reference keyframe and the most covisible ones.
         local_points: Points of the local map: those that the local keyframes observe.
         error: Moving average of the median squared error of the matches in units of their variance.
         explained_ratio: Moving average of the ratio of image cells with keypoints in which some agree with the map.
         timestamp: Of the last frame, seconds; None if unknown.
-        interval: Seconds that `velocity` takes, negative backward in time; 0 if unknown.
+        intervals: Seconds that each motion takes, negative backward in time; 0 if unknown.
     """
 
     T_cr: Float[Tensor, "4 4"]
     reference: int
     reference_size: int
-    velocity: Float[Tensor, "4 4"] | None
+    motions: Float[Tensor, "M 4 4"]
+    intervals: Float[Tensor, " M"]
     last_inlier_points: Int[Tensor, " N"]
     local_keyframes: Int[Tensor, " K"]
     local_points: Int[Tensor, " L"]
     error: float = 0.0
     explained_ratio: float = 1.0
     timestamp: float | None = None
-    interval: float = 0.0
 
     @classmethod
     def empty(cls, like: Float[Tensor, "..."]) -> TrackingState:
         """Create the state before the first keyframe, with the device and floating-point type of `like`."""
         none = torch.empty(0, dtype=torch.int64, device=like.device)
         eye = torch.eye(4, dtype=like.dtype, device=like.device)
-        return cls(eye, -1, 0, None, none, none, none)
+        return cls(eye, -1, 0, eye.new_empty(0, 4, 4), eye.new_empty(0), none, none, none)
+
+    def moved(self, motion: Float[Tensor, "4 4"], timestamp: float) -> TrackingState:
+        """The same state after a motion to a frame at a time."""
+        interval = self.intervals.new_tensor([self.seconds_to(timestamp)])
+        return replace(
+            self,
+            motions=torch.cat((self.motions, motion[None]))[-MAX_MOTIONS:],
+            intervals=torch.cat((self.intervals, interval))[-MAX_MOTIONS:],
+            timestamp=timestamp,
+        )
+
+    def without_motion(self) -> TrackingState:
+        """The same state after a frame without a pose."""
+        return replace(self, motions=self.motions[:0], intervals=self.intervals[:0])
+
+    def seconds_to(self, timestamp: float) -> float:
+        """Seconds from the last frame to one at a time; 0 if unknown."""
+        return 0.0 if self.timestamp is None else timestamp - self.timestamp
 
     def renumbered(self, keyframes: Int[Tensor, " K"], points: Int[Tensor, " L"]) -> TrackingState:
         """The same state with new rows of keyframes and points, -1 where they were removed."""
@@ -164,8 +185,7 @@ class Submap:
         if self.tracking.reference >= 0:
             around = scale[self.tracking.reference]
             self.tracking.T_cr = with_unit(self.tracking.T_cr, around)
-            if self.tracking.velocity is not None:
-                self.tracking.velocity = with_unit(self.tracking.velocity, around)
+            self.tracking.motions = with_unit(self.tracking.motions, around)
 
     def transform(self, S_ba: Float[Tensor, "4 4"]) -> None:
         """Change the coordinate frame and unit by a Sim(3): points p become S_ba p."""

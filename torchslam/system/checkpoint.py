@@ -240,9 +240,12 @@ def _camera(given: Camera, params: list[float]) -> Camera:
 
 def _check_tracking(tracking: TrackingState) -> None:
     """Check the types and shapes of a tracking state; raise ValueError or TypeError if they are wrong."""
-    for T in (tracking.T_cr, tracking.velocity):
-        if T is not None and (T.shape != (4, 4) or not T.is_floating_point() or not bool(T.isfinite().all())):
+    count = len(tracking.motions)
+    for T, shape in ((tracking.T_cr, ()), (tracking.motions, (count,))):
+        if T.shape != (*shape, 4, 4) or not T.is_floating_point() or not bool(T.isfinite().all()):
             raise ValueError("a pose of the tracking state is not a finite 4 x 4 matrix")
+    if tracking.intervals.shape != (count,) or not bool(tracking.intervals.isfinite().all()):
+        raise ValueError("the tracking state has other motions than intervals")
     for rows in (tracking.last_inlier_points, tracking.local_keyframes, tracking.local_points):
         if rows.ndim != 1 or rows.dtype != torch.int64:
             raise ValueError("the rows of the tracking state are not flat int64 tensors")

@@ -123,14 +123,13 @@ def locate(
         view: The frame.
         is_sure: Whether the poses before are certain.
     """
-    has_velocity = submap.tracking.velocity is not None
-    prior_T_cw = tracker.predict(submap)
-    estimate = tracker.track(submap, view, prior_T_cw, is_sure)
+    has_moved = len(submap.tracking.motions) > 0
+    prediction = tracker.predict(submap, view.timestamp)
+    estimate = tracker.track(submap, view, prediction, is_sure)
     verdict = None
     if estimate is not None:
-        expected_T_cw = prior_T_cw if has_velocity else None
         averages = submap.tracking.averaged_with(estimate)
-        verdict = check_pose(estimate, expected_T_cw, averages)
+        verdict = check_pose(estimate, prediction if has_moved else None, averages)
     tracker.commit(submap, view, estimate)
     return None if estimate is None or verdict is None else (estimate, verdict)
 

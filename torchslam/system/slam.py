@@ -49,7 +49,17 @@ from torchslam.system.state_machine import FrameOutcome, StateMachine
 from torchslam.tracking.matcher import make_matcher, prepare_view
 from torchslam.tracking.non_static import SceneFilter
 from torchslam.tracking.tracker import Tracker
-from torchslam.types import Explanation, Frame, FrameFeatures, Matcher, Reason, State, StepResult, Trajectory
+from torchslam.types import (
+    Explanation,
+    Frame,
+    FrameFeatures,
+    Matcher,
+    MotionModel,
+    Reason,
+    State,
+    StepResult,
+    Trajectory,
+)
 from torchslam.utils.timing import Stopwatch
 
 
@@ -65,6 +75,7 @@ class SLAM:
         extractor: The extractor, from images to `Features`, such as `ORB()`; the configured one if None. Frames that
             bring their own features, as those of `front_end.Simulated`, are not passed to it.
         matcher: The matcher of two views, see `types.Matcher`, or one of kornia; the configured one if None.
+        motion_model: Predicts the pose of a frame, see `types.MotionModel`; the configured one if None.
     """
 
     def __init__(
@@ -73,6 +84,7 @@ class SLAM:
         config: Config | None = None,
         extractor: FeatureExtractor | None = None,
         matcher: Matcher | None = None,
+        motion_model: MotionModel | None = None,
     ) -> None:
         self.config = config or Config()
         # A copy: parameters may move in place while they learn.
@@ -87,7 +99,7 @@ class SLAM:
         self.clock = Stopwatch()
         self.matcher = make_matcher(self.config.matching, matcher, camera.size, self.config.features.kind)
         self.shared_camera = SharedCamera(self.camera)
-        self.tracker = Tracker(self.shared_camera, self.config, self.matcher)
+        self.tracker = Tracker(self.shared_camera, self.config, self.matcher, motion_model)
         self.mapper = Mapper(self.shared_camera, self.config, self.clock, self.matcher)
         self.reset()
 
@@ -106,12 +118,13 @@ class SLAM:
         mapping: bool = True,
         device: torch.device | str = "cpu",
         matcher: Matcher | None = None,
+        motion_model: MotionModel | None = None,
     ) -> SLAM:
         """Start a further session in the atlas of a map file, with its camera; the first frame is relocalized.
 
         Args:
             path: A file written by `save`.
-            config, extractor, matcher: As for `SLAM`.
+            config, extractor, matcher, motion_model: As for `SLAM`.
             mapping: If False, frames are only localized: no keyframe, point or submap is created or changed.
             device: Where the system works.
 
@@ -119,7 +132,7 @@ class SLAM:
             ResultsError: If the file is missing, damaged, or has no submap to localize in.
         """
         session = Session.load(path, mapping, device)
-        slam = cls(session.camera, config, extractor, matcher)
+        slam = cls(session.camera, config, extractor, matcher, motion_model)
         slam.start_session(session)
         return slam
 

@@ -97,11 +97,11 @@ def predict_observations(
 
 
 def match_projected_points(
-    slam_map: Map, projected: Projected, view: FrameFeatures, radius_px: float, matcher: Matcher
+    slam_map: Map, projected: Projected, view: FrameFeatures, radius_px: float | Tensor, matcher: Matcher
 ) -> MatchIndices:
     """Point ids and keypoints that match within a radius around the projection, one to one.
 
-    The radius is in pixels of the pyramid level that is predicted for the point.
+    The radius, or that of each point, is in pixels of the pyramid level that is predicted for it.
     """
     if len(projected.ids) == 0:
         return MatchIndices(projected.ids, projected.ids)

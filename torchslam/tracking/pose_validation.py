@@ -16,7 +16,8 @@ from torch import Tensor
 from torchslam.geometry import se3_inverse
 from torchslam.geometry.transforms import rotation_angle
 from torchslam.map.atlas import TrackingState
-from torchslam.types import PoseEstimate, Reason, Rejection
+from torchslam.tracking.motion_model import squared_deviation
+from torchslam.types import PoseEstimate, PosePrediction, Reason, Rejection
 
 MIN_INLIER_RATIO = 0.5
 """Ratio of inliers to matches around the predicted pixels: a majority. Tried at this value only."""
@@ -26,6 +27,9 @@ degrees: about 0.9 degrees seen from the scene, or by the camera. Tried at these
 MAX_JUMP, MAX_TURN_DEG = 0.5, 20.0
 """Largest distance from the predicted position, relative to the median depth, and rotation from the predicted
 orientation, degrees. Tried at these values only."""
+MAX_SQUARED_DEVIATION = 38.3
+"""Largest squared distance from a prediction with a covariance, in units of that covariance: honest ones exceed it in
+one frame of a million (chi-square, six degrees of freedom)."""
 MAX_SQUARED_ERROR = 1.3
 """Largest median squared error in units of the noise, averaged over ten frames. Tried at 1.05 and 1.3."""
 MIN_EXPLAINED_RATIO = 0.3
@@ -74,21 +78,17 @@ class Verdict:
         return self.rejection is not None and self.rejection.reason is Reason.JUMP
 
 
-def check_pose(
-    estimate: PoseEstimate, predicted_T_cw: Float[Tensor, "4 4"] | None, averages: TrackingState
-) -> Verdict:
+def check_pose(estimate: PoseEstimate, prediction: PosePrediction | None, averages: TrackingState) -> Verdict:
     """Validate a pose by itself, and by the agreement of the recent images with the map.
 
-    `predicted_T_cw` is the pose that the motion model predicts; `averages` a tracking state with the averages over the
+    `prediction` is that of the motion model; `averages` a tracking state with the averages over the
     frames up to this one, see `TrackingState.averaged_with`.
     """
-    quality = check_pose_quality(estimate, predicted_T_cw)
+    quality = check_pose_quality(estimate, prediction)
     return Verdict(quality or check_map_agreement(estimate, averages))
 
 
-def check_pose_quality(
-    estimate: PoseEstimate, predicted_T_cw: Float[Tensor, "4 4"] | None
-) -> Rejection | None:
+def check_pose_quality(estimate: PoseEstimate, prediction: PosePrediction | None) -> Rejection | None:
     """Why a pose is wrong by its own matches, its covariance or its motion; None if it is plausible."""
     ratio = estimate.inliers / max(estimate.matches, 1)
     if ratio < MIN_INLIER_RATIO:
@@ -98,11 +98,15 @@ def check_pose_quality(
         return Rejection.of(Reason.UNCERTAIN_POSITION, std=position)
     if rotation > MAX_ROTATION_STD_DEG:
         return Rejection.of(Reason.UNCERTAIN_ROTATION, degrees=rotation)
-    if predicted_T_cw is None:
+    if prediction is None:
         return None
-    moved, turned = jump(estimate, predicted_T_cw)
-    is_turn_odd = turned > MAX_TURN_DEG and estimate.inliers < SURE_INLIERS
-    if moved > MAX_JUMP or is_turn_odd:
+    moved, turned = jump(estimate, prediction.T_cw)
+    if prediction.covariance is None:
+        is_odd = moved > MAX_JUMP or (turned > MAX_TURN_DEG and estimate.inliers < SURE_INLIERS)
+    else:
+        squared = squared_deviation(estimate.T_cw, estimate.covariance, prediction)
+        is_odd = squared > MAX_SQUARED_DEVIATION
+    if is_odd:
         return Rejection.of(Reason.JUMP, translation=moved, degrees=turned)
     return None
 

@@ -16,19 +16,30 @@ from torch import Tensor
 from torchslam.config import Config
 from torchslam.geometry import SharedCamera, se3_inverse, transform
 from torchslam.geometry.lie import se3_log
-from torchslam.geometry.transforms import reorthonormalized
 from torchslam.map.atlas import Submap, TrackingState
 from torchslam.map.map import Map
 from torchslam.tracking import localizer
-from torchslam.tracking.data_association import match_keyframe, match_points
+from torchslam.tracking.data_association import Projected, match_keyframe, match_points
 from torchslam.tracking.localizer import Localizer, match_projected_points
 from torchslam.tracking.matcher import DescriptorMatcher, make_matcher
+from torchslam.tracking.motion_model import deviating_poses, make_motion_model, run_motion_model
 from torchslam.tracking.pose_validation import check_pose
-from torchslam.types import FrameFeatures, Matcher, MatchIndices, PoseEstimate
+from torchslam.types import (
+    FrameFeatures,
+    Matcher,
+    MatchIndices,
+    MotionHistory,
+    MotionModel,
+    PoseEstimate,
+    PosePrediction,
+)
 
-SEARCH_RADIUS_PX, WIDE_RADIUS_PX = 12.0, 36.0
-"""Search radius around a projected point, pixels of the finest pyramid level, and that of the second search, made if
-the first has too few matches. Tried at these values only."""
+SEARCH_RADIUS_PX, WIDE_SEARCH = 12.0, 3.0
+"""Search radius around a projected point, pixels of the finest pyramid level, and its factor in the second search, made
+if the first has too few matches. Tried at these values only."""
+SEARCH_SIGMAS = 3.0
+"""Standard deviations of a prediction with a covariance within which keypoints are searched for, beside
+`REFINE_RADIUS_PX`. Tried at this value only."""
 RECENT_FRAMES = 60
 """Frames whose points are matched in place of the local map with `paper.brute_force`, as in the paper's system."""
 
@@ -42,10 +53,17 @@ class Tracker:
         counts: Whether observations are counted in the map; without it, tracking does not change the map.
     """
 
-    def __init__(self, camera: SharedCamera, config: Config, matcher: Matcher | None = None) -> None:
+    def __init__(
+        self,
+        camera: SharedCamera,
+        config: Config,
+        matcher: Matcher | None = None,
+        motion_model: MotionModel | None = None,
+    ) -> None:
         self.camera = camera
         self.localizer = Localizer(camera, config)
         self.matcher = make_matcher(config.matching, matcher, features=config.features.kind)
+        self.motion_model = make_motion_model(config, motion_model)
         self.brute_force = config.paper.brute_force
         self.matching = config.matching
         self.counts = True
@@ -86,13 +104,12 @@ class Tracker:
             local_points=local_points,
         )
 
-    def predict(self, submap: Submap) -> Float[Tensor, "4 4"]:
-        """Predicted pose of the next frame, by constant velocity."""
-        if self.brute_force:
-            return reorthonormalized(submap.T_cw)
-        if submap.tracking.velocity is None:
-            return submap.T_cw
-        return reorthonormalized(submap.tracking.velocity @ submap.T_cw)
+    def predict(self, submap: Submap, timestamp: float) -> PosePrediction:
+        """Predicted pose of the next frame, at a time."""
+        tracking = submap.tracking
+        interval = tracking.seconds_to(timestamp)
+        history = MotionHistory(submap.T_cw, tracking.motions, tracking.intervals, interval)
+        return run_motion_model(self.motion_model, history)
 
     # --- one frame -------------------------------------------------------------------------------------------
 
@@ -100,17 +117,17 @@ class Tracker:
         self,
         submap: Submap,
         view: FrameFeatures,
-        prior_T_cw: Float[Tensor, "4 4"] | None = None,
+        prediction: PosePrediction | None = None,
         is_sure: bool = True,
     ) -> PoseEstimate | None:
         """Estimate the pose of the next frame, see `at_middle_row`; None if it cannot be found. Nothing is changed.
 
-        Matches are searched for around `prior_T_cw`, the predicted pose if None. If the last poses are certain
+        Matches are searched for around `prediction`, that of the motion model if None. If the last poses are certain
         (`is_sure`), a pose near it is tried first.
         """
-        prior_T_cw = self.predict(submap) if prior_T_cw is None else prior_T_cw
-        candidates = self._candidates(submap, view, prior_T_cw)
-        near = prior_T_cw if is_sure else None
+        prediction = prediction or self.predict(submap, view.timestamp)
+        candidates = self._candidates(submap, view, prediction)
+        near = prediction.T_cw if is_sure else None
         return self.localizer.locate(submap.map, view, candidates, submap.tracking.local_points, near)
 
     def at_middle_row(self, submap: Submap, view: FrameFeatures) -> FrameFeatures:
@@ -120,24 +137,29 @@ class Tracker:
         Without a readout it is the view itself.
         """
         tracking = submap.tracking
-        if self.camera.model.readout is None or tracking.velocity is None or not tracking.interval:
+        interval = float(tracking.intervals[-1]) if len(tracking.motions) else 0.0
+        if self.camera.model.readout is None or not interval:
             return view
         depths = transform(submap.T_cw, submap.map.positions_w[tracking.local_points])[:, 2]
         depths = depths[depths > 0]
         if len(depths) == 0:
             return view
-        velocity = se3_log(tracking.velocity) / tracking.interval
+        velocity = se3_log(tracking.motions[-1]) / interval
         return replace(view, keypoints=self.camera.at_middle_row(view.detected, velocity, depths.median()))
 
-    def _candidates(self, submap: Submap, view: FrameFeatures, T_cw: Tensor) -> Iterator[MatchIndices]:
+    def _candidates(
+        self, submap: Submap, view: FrameFeatures, prediction: PosePrediction
+    ) -> Iterator[MatchIndices]:
         """Sets of matches by ever wider search: near the predicted pixels, in a wider window, in the whole image."""
-        slam_map, tracking = submap.map, submap.tracking
+        slam_map, tracking, T_cw = submap.map, submap.tracking, prediction.T_cw
         if not self.brute_force:
             alive = tracking.last_inlier_points[slam_map.points["is_valid"][tracking.last_inlier_points]]
             near = self.localizer.project(slam_map, alive, T_cw, view)
-            yield match_projected_points(slam_map, near, view, SEARCH_RADIUS_PX, self.matcher)
+            radius = self._search_radius(slam_map, near, prediction)
+            yield match_projected_points(slam_map, near, view, radius, self.matcher)
             local = self.localizer.project(slam_map, tracking.local_points, T_cw, view)
-            yield match_projected_points(slam_map, local, view, WIDE_RADIUS_PX, self.matcher)
+            radius = WIDE_SEARCH * self._search_radius(slam_map, local, prediction)
+            yield match_projected_points(slam_map, local, view, radius, self.matcher)
         else:
             local = self.localizer.project(slam_map, tracking.local_points, T_cw, view)
         yield match_points(slam_map, local.ids, view, self.matching)
@@ -147,22 +169,31 @@ class Tracker:
             for keyframe in dict.fromkeys((tracking.reference, newest)):
                 yield match_keyframe(slam_map, keyframe, view, self.matcher)
 
+    def _search_radius(
+        self, slam_map: Map, projected: Projected, prediction: PosePrediction
+    ) -> float | Float[Tensor, " N"]:
+        """Search radii around predicted pixels, in pixels of the pyramid level of each point."""
+        if prediction.covariance is None:
+            return SEARCH_RADIUS_PX
+        moved = deviating_poses(prediction.T_cw, prediction.covariance)
+        pixels, _ = self.camera.current.project(transform(moved, slam_map.positions_w[projected.ids]))
+        std = (pixels - projected.pixels).square().sum((0, 2)).sqrt()
+        widest = max(self.camera.current.size)
+        radius = localizer.REFINE_RADIUS_PX + SEARCH_SIGMAS * std / projected.scales
+        return radius.nan_to_num(widest).clamp_max(widest)
+
     def commit(self, submap: Submap, view: FrameFeatures, estimate: PoseEstimate | None) -> None:
         """Update the tracking state by a frame: velocity, averages, reference keyframe, `last_seen_frame`.
 
-        Without an estimate the velocity is unknown from here on.
+        Without an estimate the motion is unknown from here on.
         """
         if estimate is None:
-            submap.tracking.velocity = None
+            submap.tracking = submap.tracking.without_motion()
             return
-        slam_map, before = submap.map, submap.tracking.timestamp
-        velocity = estimate.T_cw @ se3_inverse(submap.T_cw)
+        slam_map, motion = submap.map, estimate.T_cw @ se3_inverse(submap.T_cw)
         tracking = replace(
-            submap.tracking.averaged_with(estimate),
-            velocity=velocity,
+            submap.tracking.averaged_with(estimate).moved(motion, view.timestamp),
             last_inlier_points=estimate.point_ids,
-            timestamp=view.timestamp,
-            interval=0.0 if before is None else view.timestamp - before,
         )
         self._update_last_seen(slam_map, view, estimate)
         shared = slam_map.count_observed(estimate.point_ids, tracking.local_keyframes)

@@ -323,6 +323,15 @@ class PointBlocks(NamedTuple):
     matrix: Tensor
 
 
+class LinearErrors(NamedTuple):
+    """Errors (F, D) of one kind, their derivatives (F, D, 6 n + 3 m) or (1, D, C), and their information."""
+
+    kind: FactorKind
+    error: Tensor
+    J: Tensor
+    information: Tensor
+
+
 def factor_kinds(factors: Sequence[Factors]) -> list[FactorKind]:
     """The discrete parts of factors that `packed_factors` has accepted."""
     return [
@@ -431,6 +440,7 @@ class FactorTerms(NamedTuple):
     camera_gradient: Tensor
     camera: Tensor
     points: PointBlocks | None
+    errors: tuple[LinearErrors, ...]
 
 
 def factor_terms(
@@ -452,11 +462,13 @@ def factor_terms(
     camera_gradient, camera = T_cw.new_zeros(most), T_cw.new_zeros(most, most)
     frames, points = T_cw.new_zeros(count, 6, 6), T_cw.new_zeros(num_points, 3, 3)
     pairs, blocks, joined = [torch.zeros_like(kinds[0].pairs[:0])], [T_cw.new_zeros(0, 6, 6)], []
+    errors = []
     for kind, own, matrix in _unpacked(kinds, measured, information):
         moved = moved_errors(kind, at, own, directions, in_world=True)
         n, m = kind.frames.shape[1], kind.points.shape[1]
         zero = T_cw.new_zeros(len(kind.frames), most if kind.of_camera else 6 * n + 3 * m)
         error, J = _with_jacobian(moved, zero)
+        errors.append(LinearErrors(kind, error, J, matrix))
         pulled = J.mT @ matrix
         slope, hessian = (pulled @ error[..., None]).squeeze(-1), pulled @ J
         if curvature != "none":
@@ -495,7 +507,29 @@ def factor_terms(
     if any(kind.points.shape[1] for kind in kinds):
         joining = PointBlocks(gradient[split:].view(-1, 3), points, *_beside(joined, gradient))
     of_frames = gradient[:split].view(-1, 6), frames, between
-    return FactorTerms(cost, *of_frames, camera_gradient, camera, joining)
+    return FactorTerms(cost, *of_frames, camera_gradient, camera, joining, tuple(errors))
+
+
+def scale_step(
+    errors: Sequence[LinearErrors], of_frames: Float[Tensor, "K 6 g"], of_points: Float[Tensor, "N 3 g"]
+) -> float:
+    """The share by which errors ask for a smaller scale, the first of g motions of the world, along the axes of which
+    frames and points move, by a step of Gauss and Newton in all of them; zero where they do not depend on it."""
+    motions = of_frames.shape[-1]
+    gradient, hessian = of_frames.new_zeros(motions), of_frames.new_zeros(motions, motions)
+    for kind, error, J, information in errors:
+        if not kind.of_camera:
+            moved = of_frames[kind.frames].flatten(1, 2), of_points[kind.points].flatten(1, 2)
+            along = J @ torch.cat(moved, dim=1)
+            pulled = (information @ along).flatten(0, 1)
+            gradient, hessian = (
+                gradient + pulled.mT @ error.flatten(),
+                hessian + pulled.mT @ along.flatten(0, 1),
+            )
+    size = hessian.diagonal().clamp_min(0).sqrt()
+    size = torch.where(size > 0, size, 1.0)
+    inverse = torch.linalg.pinv(hessian / (size[:, None] * size), rtol=1e-9, hermitian=True)
+    return float(inverse[0] @ (gradient / size) / size[0])
 
 
 def _beside(joined: list[tuple[Tensor, Tensor]], like: Tensor) -> tuple[Tensor, Tensor]:

@@ -20,6 +20,7 @@ from torchslam.optim.bundle._factors import (
     FactorKind,
     Factors,
     FrameBlocks,
+    LinearErrors,
     PointBlocks,
     frames_with_factors,
     packed_factors,
@@ -333,6 +334,7 @@ class PriorTerms(NamedTuple):
     cameras: Tensor
     between: FrameBlocks | None = None
     points: PointBlocks | None = None
+    errors: tuple[LinearErrors, ...] = ()
 
     def in_world(self, R_cw: Tensor) -> PriorTerms:
         """The same for frames (..., K, 3, 3) that move along the axes of the world."""

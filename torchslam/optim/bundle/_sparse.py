@@ -41,6 +41,7 @@ from torchslam.optim.bundle._factors import (
     PointBlocks,
     depth_terms,
     factor_terms,
+    scale_step,
     with_depths,
 )
 from torchslam.optim.bundle._problem import (
@@ -65,10 +66,10 @@ from torchslam.optim.bundle._schur import (
 
 Curvature = Literal["none", "definite", "exact"]
 """As of `factor_terms`."""
-_DRIFT, _DRIFT_GAIN, _DRIFT_STEPS = 0.01, 0.01, 10
-"""A minimization with factors is given up after this many steps that each change the distances of points from cameras
-by this share, but lower the cost by less than this one. Healthy ones reach another scale in a few steps. Tried at these
-values only."""
+_DRIFT, _DRIFT_GAIN, _DRIFT_STEPS = 0.3, 0.01, 10
+"""A minimization with factors is given up after this many steps that each lower the cost by less than this share, while
+the factors still ask for a scale that differs by this one. Healthy ones reach it in a few steps. Tried at these values
+only."""
 _INNER_FRAMES = 32
 """Free frames from which on points take steps of their own: parts of a window of few frames do not move against each
 other, and it converges in a few steps."""
@@ -197,6 +198,7 @@ class SparseModel:
 
     estimate: BundleEstimate
     cost: Float[Tensor, " 1"]
+    terms: PriorTerms | None
     assembled: Callable[[], NormalEquations]
 
     @cached_property
@@ -275,6 +277,7 @@ class SparseBundle:
         return SparseModel(
             estimate,
             cost[None],
+            terms,
             lambda: _with_priors(self._equations(estimate, use_curvature, kept=kept), terms),
         )
 
@@ -356,16 +359,20 @@ class SparseBundle:
 
     def drifts(self, old: SparseModel, new: SparseModel, relative_reduction: Tensor) -> Tensor:
         """Whether factors shrink or grow the map without end: a plane that the camera does not keep is kept best by a
-        map without extent."""
-        if not self.kinds:
-            return torch.zeros_like(self.solvable)
-        rows = self.layout.observations
-        before, after = (
-            float(self._seen(model.estimate).points_c.norm(dim=-1).log().mean()) if len(rows) else 0.0
-            for model in (old, new)
-        )
-        is_drift = abs(after - before) > _DRIFT and float(relative_reduction) < _DRIFT_GAIN
-        self.drift_steps = self.drift_steps + 1 if is_drift else 0
+        map without extent.
+
+        Images do not depend on the scale, so that the factors alone ask for it: by the step of Gauss and Newton in all
+        motions of the world. At a minimum it is zero, and for a map without extent always one.
+        """
+        motions = self._motions(new.estimate) if self.kinds else None
+        step = 0.0
+        if motions is not None and motions[0].shape[-1] in (1, 7) and float(relative_reduction) < _DRIFT_GAIN:
+            of_frames, of_points = motions
+            frames = torch.zeros_like(new.estimate.T_cw[:, :1, 0, None]).repeat(1, 6, of_frames.shape[-1])
+            frames = frames.index_copy(0, self.layout.free_frames, of_frames)
+            of_points = of_points * self.layout.free_points[:, None, None]
+            step = scale_step(new.terms.errors, frames, of_points)
+        self.drift_steps = self.drift_steps + 1 if abs(step) > _DRIFT else 0
         return torch.full_like(self.solvable, self._has_drifted)
 
     @property
@@ -390,8 +397,9 @@ class SparseBundle:
         points_w = estimate.points_w.index_select(0, self.layout.point_rank)
         return BundleEstimate(estimate.T_cw[None], points_w[None], estimate.params[None])
 
-    def _gauge(self, estimate: BundleEstimate) -> Tensor | None:
-        """Gauge directions (K', 6, g): the scale, or a similarity; None where the gauge is fixed.
+    def _motions(self, estimate: BundleEstimate) -> tuple[Tensor, Tensor] | None:
+        """How free frames (K', 6, g) and points (N, 3, g) move with the world, as far as observations and what is fixed
+        allow: its scale, all motions of a similarity, or the rigid ones; None where the gauge is fixed.
 
         In the axes of the world, as are all vectors of the equations.
         """
@@ -405,24 +413,26 @@ class SparseBundle:
             return None
         T_free = T_cw[layout.free_frames]
         origin = se3_inverse(anchors[0] if len(anchors) else T_free[0])[:3, 3]
-        motions = gauge_motions(T_free, origin)
-        motions = motions[..., :1] if len(anchors) else motions
         has_depths = self.depths is not None and bool((self.depths[1] > 0).any())
-        if has_depths:  # they hold the scale, which comes first
-            if len(anchors):
-                return None
-            motions = motions[..., 1:]
-        every, motions = motions, torch.linalg.qr(motions.flatten(0, 1)).Q.unflatten(0, (-1, 6))
+        first, end = int(has_depths), 1 if len(anchors) else 7  # depths hold the scale, which comes first
+        if first == end:
+            return None
+        moved = gauge_motions(T_free, origin), _moved_with_gauge(estimate.points_w, origin)
+        return moved[0][..., first:end], moved[1][..., first:end]
+
+    def _gauge(self, estimate: BundleEstimate) -> Tensor | None:
+        """Gauge directions (K', 6, g): those of `_motions` that priors and factors leave open, orthonormal."""
+        every = self._motions(estimate)
+        if every is None:
+            return None
+        of_frames, of_points = every
+        motions = torch.linalg.qr(of_frames.flatten(0, 1)).Q.unflatten(0, (-1, 6))
         with torch.no_grad():
             priors = self._priors(estimate)
             if priors is None:
                 return motions
-            of_points = None
-            if priors.points is not None:
-                moved = _moved_with_gauge(estimate.points_w, origin)
-                moved = moved[..., :1] if len(anchors) else moved[..., 7 - every.shape[-1] :]
-                of_points = moved @ torch.linalg.lstsq(every.flatten(0, 1), motions.flatten(0, 1)).solution
-            return open_motions(motions, priors, of_points)
+            mixed = torch.linalg.lstsq(of_frames.flatten(0, 1), motions.flatten(0, 1)).solution
+            return open_motions(motions, priors, of_points @ mixed)
 
     def _priors(self, estimate: BundleEstimate, curvature: Curvature = "none") -> PriorTerms | None:
         """What priors on free frames (K') and cameras, and factors, add, in the axes of the world."""
@@ -468,6 +478,7 @@ class SparseBundle:
             cameras=terms.cameras + found.camera,
             between=FrameBlocks(slots[first[joined]], slots[second[joined]], blocks[joined]),
             points=points,
+            errors=found.errors,
         )
 
     def marginals(self, estimate: BundleEstimate) -> Marginals:
