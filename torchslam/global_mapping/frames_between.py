@@ -211,7 +211,7 @@ def pose_frames(
 def _add_keyframe(tracker: Tracker, submap: Submap, view: FrameFeatures, keyframe: int) -> StepResult:
     """Add a keyframe with its pose of the map."""
     tracker.reset_to_keyframe(submap, keyframe)
-    submap.tracking.velocity = None
+    submap.tracking = submap.tracking.without_motion()
     own = _keyframe_estimate(submap.map, keyframe)
     submap.posed_frames.add(view, own, submap.tracking.T_cr, keyframe)
     return StepResult(

@@ -366,7 +366,12 @@ class SparseBundle:
         """
         motions = self._motions(new.estimate) if self.kinds else None
         step = 0.0
-        if motions is not None and motions[0].shape[-1] in (1, 7) and float(relative_reduction) < _DRIFT_GAIN:
+        if (
+            motions is not None
+            and new.terms is not None
+            and motions[0].shape[-1] in (1, 7)
+            and float(relative_reduction) < _DRIFT_GAIN
+        ):
             of_frames, of_points = motions
             frames = torch.zeros_like(new.estimate.T_cw[:, :1, 0, None]).repeat(1, 6, of_frames.shape[-1])
             frames = frames.index_copy(0, self.layout.free_frames, of_frames)
