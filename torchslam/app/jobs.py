@@ -34,7 +34,7 @@ DEMO = "synthetic:room"
 # In the folder of a run: see `Record`; its messages; held while it goes on, with its process; there while it waits.
 RECORD, LOG, LOCK, QUEUE = "app.json", "run.log", "app.lock", "app.queue"
 INPUT = "input"  # file without its suffix, or folder, of what was uploaded
-INTERRUPTED = "torchslam: interrupted"  # the last message of a run that was stopped, as of `cli.main`
+INTERRUPTED = "torchslam: interrupted"  # how the last message of a run that was stopped begins
 MAX_QUEUED = 20  # runs that wait; more are a mistake
 MAX_TITLE = 120  # characters of a file name that are shown
 LOG_TAIL = 1 << 14  # bytes of the log that are shown: about 100 lines
@@ -108,7 +108,8 @@ class Runs:
             return State.STOPPED
         if (path / METRICS).exists():
             return State.DONE
-        return State.STOPPED if (log_tail(path) or [INTERRUPTED])[-1] == INTERRUPTED else State.FAILED
+        last = (log_tail(path) or [INTERRUPTED])[-1]
+        return State.STOPPED if last.startswith(INTERRUPTED) else State.FAILED
 
     def seconds(self, name: str) -> float:
         """How long the process of a run has gone on, or went on; 0 before."""
