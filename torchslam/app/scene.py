@@ -10,9 +10,10 @@ import viser
 from jaxtyping import Bool, Float, Int
 from viser.transforms import SO3
 
-# Red, green, blue.
 PATH, UNCERTAIN, TRUTH, OTHER = (87, 150, 65), (190, 130, 225), (60, 60, 60), (230, 140, 40)
+"""Red, green, blue."""
 FRUSTUM, MARK = (70, 110, 190), (230, 60, 50)
+"""As `PATH`."""
 BEADS = 4000
 """Points that a path is drawn by. They touch up to a path of ten times the scene. Without a GPU a point takes 1 µs of a
 frame, a line segment of the viewer 100 µs."""
