@@ -295,7 +295,10 @@ class NormalEquations:
         root = torch.where(self.free_points[:, None, None], root, 0.0)
         directions = None if gauge is None else gauge.flatten(0, 1)
         find = self._dense if self.structure.pairs is None else self._blocks
-        return FactorizedEquations(self, root, find(self.whitened(root), damping, directions))
+        is_small = self.structure.num_linked <= AT_ONCE
+        kept = list(self.whitened(root)) if is_small else None
+        tiles = self.whitened(root) if kept is None else kept
+        return FactorizedEquations(self, root, find(tiles, damping, directions), kept)
 
     def _dense(
         self, tiles: Iterable[TileCoupling], damping: Tensor | None, gauge: Tensor | None
@@ -413,11 +416,12 @@ class FactorizedEquations:
     equations: NormalEquations
     points_root: Float[Tensor, "N 3 3"]
     reduced: Reduced
+    kept: list[TileCoupling] | None
 
     @property
-    def tiles(self) -> Iterator[TileCoupling]:
-        """As of `NormalEquations.whitened`."""
-        return self.equations.whitened(self.points_root)
+    def tiles(self) -> Iterable[TileCoupling]:
+        """As of `NormalEquations.whitened`, kept in small problems."""
+        return self.equations.whitened(self.points_root) if self.kept is None else self.kept
 
     @property
     def definite(self) -> Bool[Tensor, ""]:
@@ -466,23 +470,16 @@ class FactorizedEquations:
     def _solve_apart(self, right: BundleTangent) -> BundleTangent:
         """As `solve`, without the factors that join points."""
         reduced_right = torch.cat((right.frames.flatten(), right.cameras.flatten()))
-        alone, pulls = self._of_points(right.points), list[Tensor]()
-        for points, rows, W in self.equations.tiles():
-            reduced_right = reduced_right.index_add(0, rows, -(W.mT @ alone[points].flatten()))
+        halves = (self.points_root @ right.points[..., None]).squeeze(-1)
+        for points, rows, A in self.tiles:
+            reduced_right = reduced_right.index_add(0, rows, -(A.mT @ halves[points].flatten()))
         solution = self.reduced.solve(reduced_right[:, None]).squeeze(-1)
-        for _, rows, W in self.equations.tiles():
-            pulls.append((W @ solution[rows]).view(-1, 3))
-        moved = (
-            alone - self._of_points(torch.cat(pulls)) if pulls else alone
-        )  # without points there are no tiles
+        remainders = [halves[points] - (A @ solution[rows]).view(-1, 3) for points, rows, A in self.tiles]
+        halves = torch.cat(remainders) if remainders else halves  # without points there are no tiles
+        moved = (self.points_root.mT @ halves[..., None]).squeeze(-1)
         frame_rows, camera_rows = self.equations.rows
         moved = torch.where(self.reduced.definite, moved, 0.0)
         return BundleTangent(solution[frame_rows], moved, solution[camera_rows])
-
-    def _of_points(self, right: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
-        """The solution where only points move."""
-        halves = self.points_root @ right[..., None]
-        return (self.points_root.mT @ halves).squeeze(-1)
 
     def marginals(self) -> Marginals:
         """The diagonal blocks of H^-1."""
