@@ -237,7 +237,7 @@ def ended_worse_not_right(case: Columns) -> Outcome:
 
 
 def _has_zoom(case: Columns) -> bool:
-    return case["final"]["zoom_extent"] is not None
+    return case["final"].get("zoom_extent") is not None
 
 
 def zoom_found_without(case: Columns) -> Outcome:

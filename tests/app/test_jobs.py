@@ -45,12 +45,12 @@ def runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Runs:
 def test_one_run_goes_on_at_a_time_and_the_next_follows(runs: Runs) -> None:
     first, second = runs.add("first", DEMO, ()), runs.add("second", DEMO, ("--dense",))
     runs.advance()
-    wait_until(lambda: "begun" in "".join(jobs.log_tail(runs.path(first))), 20)
+    wait_until(lambda: "begun" in "".join(jobs.log_tail(runs.path(first))))
     assert (runs.state(first), runs.state(second), runs.running()) == (State.RUNNING, State.QUEUED, first)
     with pytest.raises(ResultsError, match="stop it first"):
         runs.delete(first)
     runs.stop(first)
-    wait_until(lambda: runs.state(first) is not State.RUNNING, 20)
+    wait_until(lambda: runs.state(first) is not State.RUNNING)
     runs.advance()
     assert runs.state(first) is State.STOPPED
     assert runs.running() == second
@@ -59,7 +59,7 @@ def test_one_run_goes_on_at_a_time_and_the_next_follows(runs: Runs) -> None:
     assert runs.state(first) is State.QUEUED
     runs.stop(first)
     assert runs.state(first) is State.STOPPED
-    wait_until(lambda: runs.running() is None, 20)
+    wait_until(lambda: runs.running() is None)
     runs.delete(first)
     assert first not in runs.names()
 
@@ -71,7 +71,7 @@ def test_another_server_finds_a_run_that_goes_on_and_keeps_what_has_ended(runs: 
     assert again.state(name) is State.RUNNING
     again.advance()  # starts no second one
     again.stop(name)
-    wait_until(lambda: again.state(name) is not State.RUNNING, 20)
+    wait_until(lambda: again.state(name) is not State.RUNNING)
     assert again.state(name) is State.STOPPED
     path = runs.path(name)
     (path / METRICS).write_text("{}")
@@ -84,9 +84,9 @@ def test_another_server_finds_a_run_that_goes_on_and_keeps_what_has_ended(runs: 
 def test_a_run_that_crashed_is_failed(runs: Runs) -> None:
     name = runs.add("x", DEMO)
     runs.advance()
-    wait_until(lambda: "begun" in "".join(jobs.log_tail(runs.path(name))), 20)
+    wait_until(lambda: "begun" in "".join(jobs.log_tail(runs.path(name))))
     os.kill(int((runs.path(name) / LOCK).read_text()), signal.SIGKILL)
-    wait_until(lambda: runs.running() is None, 20)
+    wait_until(lambda: runs.running() is None)
     assert runs.state(name) is State.FAILED
     assert 0 <= runs.seconds(name) < 60
     runs.resume(name)

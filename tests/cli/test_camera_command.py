@@ -102,20 +102,24 @@ def test_conflicting_options_are_refused(
 @pytest.mark.parametrize(
     "camera",
     [
-        Camera.pinhole(1.5, 2.25, 3.0, 4.0, size=(8, 6)),
-        Camera.radial_tangential(1.5, 2.25, 3.0, 4.0, -0.1, 0.25, 0.0, 1e-3, size=(8, 6)),
-        Camera.fisheye(1.5, 2.25, 3.0, 4.0, -0.1, 0.25, 0.0, 1e-3, size=(8, 6)),
-        Camera("rational", torch.tensor([1.5, 2.25, 3.0, 4.0, *8 * [0.125]], dtype=torch.float64), (8, 6)),
+        Camera.pinhole(150.5, 225.25, 300.0, 400.0, size=(800, 600)),
+        Camera.radial_tangential(150.5, 225.25, 300.0, 400.0, -0.1, 0.25, 0.0, 1e-3, size=(800, 600)),
+        Camera.fisheye(150.5, 225.25, 300.0, 400.0, -0.1, 0.25, 0.0, 1e-3, size=(800, 600)),
+        Camera(
+            "rational",
+            torch.tensor([150.5, 225.25, 300.0, 400.0, *8 * [0.125]], dtype=torch.float64),
+            (800, 600),
+        ),
     ],
 )
 def test_the_calibration_file_round_trips(camera: Camera, tmp_path: Path) -> None:
     path = tmp_path / "calibration.txt"
     check_replaceable(path)
-    write_calibration(path, camera, ["focal length 1.5 ± 0.1 px"])
+    write_calibration(path, camera, ["focal length 150.5 ± 0.1 px"])
     read = read_calibration(path).camera(camera.size)
     assert read.model == camera.model
     torch.testing.assert_close(read.params, camera.params)
-    assert "# focal length 1.5 ± 0.1 px\n" in path.read_text(encoding="utf-8")
+    assert "# focal length 150.5 ± 0.1 px\n" in path.read_text(encoding="utf-8")
     check_replaceable(path)
     path.write_text("1 1 1 1\n")
     with pytest.raises(ResultsError, match="not replaced, since"):

@@ -266,6 +266,25 @@ def test_a_right_case_counts_where_it_can_be_wrong() -> None:
     assert totals["map bent by 1 to 2 % of its extent: called not right"] == (0, 1)
 
 
+def test_zooms_are_counted_where_they_are_and_where_they_are_not() -> None:
+    found = _columns()["final"] | {"zoom_extent": 0.3}
+    off = _columns()["errors"] | {"ate": 0.06}
+    title = "zoom found where there is none"
+    assert _count(title, _columns(), _columns(name="b", final=found)) == (1, 2)
+    zoomed, with_zoom, doubted, wrong = (
+        _columns(name=name, kind="zoomed", states=states, **more)
+        for name, states, more in (
+            ("a", {}, {}),
+            ("b", {}, {"final": found}),
+            ("c", {"uncertain": 3}, {"errors": off}),
+            ("d", {}, {"errors": off}),
+        )
+    )
+    assert _count(title, zoomed, with_zoom) == (0, 0)
+    assert _count("zoom found", zoomed, with_zoom) == (1, 2)
+    assert _count("zoom: path off by more than 5 %, and no frame uncertain", zoomed, doubted, wrong) == (1, 3)
+
+
 def _change(**more: Any) -> dict[str, Any]:
     return {"is_camera": True, "focal": 500.0, "k1": 0.0, "k2": 0.0, "readout_ms": None} | more
 
