@@ -45,7 +45,7 @@ STD = 0.2
 LEAST_SPREAD, LEAST_EXPLAINED = 0.0035, 0.02
 """Standard deviation of the logarithms of focal lengths along a recording, and gain for each observation, from which
 on a zoom is undone: errors of the lens are shared by all points, and a held-out half of them confirms those as well. Of
-117 windows of 12, 24 and 40 keyframes and whole recordings without a known change, one has both (.0038, .035); garden,
+111 windows of 12, 24 and 40 keyframes and whole recordings without a known change, one has both (.0038, .035); garden,
 whose focal length changes by 1 %, has up to .005 and .05. Rendered changes of 2 % have .0061 and .06 or more."""
 WALKS = 3e-4, 1e-3, 3e-3, 1e-2, math.inf
 """Scales of the step of the logarithm from one focal length to the next, of which the smallest is used that predicts
@@ -74,6 +74,7 @@ class ZoomEstimate:
             than by one focal length.
         observations: number of those.
         spread: standard deviation of the logarithms of the ratios after the first step.
+        is_known: whether there is a zoom, of which a part was undone: what is left is believed with less gain.
     """
 
     zoom: Zoom
@@ -81,10 +82,13 @@ class ZoomEstimate:
     gain: Gain
     observations: int
     spread: float
+    is_known: bool = False
 
     @property
     def is_found(self) -> bool:
-        """Whether the zoom is worth to be undone."""
+        """Whether the zoom is to be undone."""
+        if self.is_known and self.gain.total > 0:
+            return True
         is_explained = self.gain.is_worth() and self.gain.total > LEAST_EXPLAINED * self.observations
         return is_explained and self.spread > LEAST_SPREAD
 
@@ -102,7 +106,7 @@ def find_zoom(
         graph: of one session.
         given: the camera with its error.
         options: of the adjustment of its keyframes.
-        is_known: whether there is a zoom, of which a part was undone: what is left is worth less.
+        is_known: as of the estimate.
 
     Returns:
         The estimate; None for too few keyframes, or where the observations do not determine it.
@@ -124,8 +128,9 @@ def find_zoom(
     gain, nodes = evidence.gain(nodes, walk), evidence.moved(nodes, walk)
     logs = shares @ (nodes - nodes.mean())
     spread = float(logs.std())
-    found = ZoomEstimate(_zoom(graph, keyframes, logs), first.camera, gain, len(first.pixels), spread)
-    if not found.is_found and not (is_known and gain.total > 0):
+    zoom = _zoom(graph, keyframes, logs)
+    found = ZoomEstimate(zoom, first.camera, gain, len(first.pixels), spread, is_known)
+    if not found.is_found:
         return found
     fine = first.pixels.new_zeros(min(count, FINE_NODES))
     nodes = _shares(torch.linspace(0, 1, len(fine), dtype=fine.dtype, device=fine.device), nodes) @ nodes

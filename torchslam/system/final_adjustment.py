@@ -166,15 +166,15 @@ class FinalAdjustment:
         assert self._free is not None
         graph = submap.posed_frames.graph(submap.map, self.sensor)
         found = find_zoom(graph, self._free, ROUGH, self.has_zoom)
-        if found is None or not (found.is_found or (self.has_zoom and found.gain.total > 0)):
+        if found is None or not found.is_found:
             return
         self.zoom = found.zoom
         submap.undo_zoom(self.zoom, self.sensor.camera)
         self._use(found.camera)
         self._solve(submap, ROUGH)
-        with_jumps_too = with_jumps(self._graph(submap), self.zoom, ROUGH)
-        submap.undo_zoom(with_jumps_too.beyond(self.zoom), self.sensor.camera)
-        self.zoom = with_jumps_too
+        whole = with_jumps(self._graph(submap), self.zoom, ROUGH)
+        submap.undo_zoom(whole.beyond(self.zoom), self.sensor.camera)
+        self.zoom = whole
         self._solve(submap, ROUGH)
         self._correct(submap)
 

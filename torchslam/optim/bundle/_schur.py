@@ -376,23 +376,21 @@ class NormalEquations:
         rows = torch.arange(split + num_cameras * num_free, device=self.frames.device)
         return rows[:split].view(-1, FRAME_DIMS), rows[split:].view(num_cameras, num_free)
 
-    def tiles(self) -> Iterator[TileCoupling]:
-        """The coupling of each tile with frames and cameras."""
+    def whitened(self, root: Float[Tensor, "N 3 3"]) -> Iterator[TileCoupling]:
+        """The coupling of each tile with frames and cameras, times the inverse roots of the points' blocks.
+
+        Tile by tile, since all of them take as much memory as the coupling itself.
+        """
         frame_rows, camera_rows = self.rows
         for tile in self.structure.tiles:
-            height = 3 * (tile.points.stop - tile.points.start)
+            count = tile.points.stop - tile.points.start
             rows = frame_rows[tile.frames.members].flatten()
-            coupling = self.coupling[tile.frames.storage].view(height, len(rows))
+            coupling = self.coupling[tile.frames.storage].view(count, 3, len(rows))
             if camera_rows.numel():
                 more = camera_rows[tile.cameras.members].flatten()
-                of_cameras = self.camera_coupling[tile.cameras.storage].view(height, len(more))
+                of_cameras = self.camera_coupling[tile.cameras.storage].view(count, 3, len(more))
                 rows, coupling = torch.cat((rows, more)), torch.cat((coupling, of_cameras), dim=-1)
-            yield TileCoupling(tile.points, rows, coupling)
-
-    def whitened(self, root: Float[Tensor, "N 3 3"]) -> Iterator[TileCoupling]:
-        """The same times the inverse roots of the points' blocks, tile by tile: all take as much memory as these."""
-        for points, rows, W in self.tiles():
-            yield TileCoupling(points, rows, (root[points] @ W.unflatten(0, (-1, 3))).flatten(0, 1))
+            yield TileCoupling(tile.points, rows, (root[tile.points] @ coupling).flatten(0, 1))
 
 
 def _at(rows: Int[Tensor, "M r"], columns: Int[Tensor, "M c"]) -> tuple[Tensor, Tensor]:
@@ -401,7 +399,8 @@ def _at(rows: Int[Tensor, "M r"], columns: Int[Tensor, "M c"]) -> tuple[Tensor, 
 
 
 class TileCoupling(NamedTuple):
-    """The points of a tile, the rows of the reduced system of its frames and cameras, and the coupling of both."""
+    """The points of a tile, the rows of the reduced system of its frames and cameras, and the whitened coupling of
+    both."""
 
     points: slice
     rows: Int[Tensor, " R"]
