@@ -40,8 +40,8 @@ LARGE_ZOOM = 0.03
 """Change of the logarithm of the focal length from which on a recording is processed again without it, or its frames
 are doubtful: by less, the map is the same, and is adjusted to corrected keypoints. Tried at this value only."""
 MOST_AGAIN = 2
-"""How often it is processed again. Of eleven rendered zooms by 1.4, six are still off by more than that after
-once. Tried at 1 and 2."""
+"""Most times that it is processed again: after one, six of eleven rendered zooms by 1.4 are still off by more than 3 %.
+Tried at 1 and 2."""
 UNMEASURED = "interrupted; `torchslam align` measures later"
 """Why an interrupted run has an arbitrary unit."""
 KeyframePairs = tuple[list[FrameFeatures], list[ViewPair]]
