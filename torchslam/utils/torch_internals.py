@@ -29,7 +29,7 @@ __all__ = [
 
 T = TypeVar("T")
 
-int8_matmul: Callable[[Tensor, Tensor], Tensor] | None = getattr(torch, "_int_mm", None)
+int8_matmul: Callable[..., Tensor] | None = getattr(torch, "_int_mm", None)
 """Product of int8 matrices as int32; None where this build of torch has none."""
 
 

@@ -118,16 +118,20 @@ def sign_products(
 
 
 def int8_product(
-    left: Int[Tensor, "*batch M K"], right: Int[Tensor, "*batch K N"]
+    left: Int[Tensor, "*batch M K"], right: Int[Tensor, "*batch K N"], out: Int[Tensor, "*batch M N"] | None = None
 ) -> Num[Tensor, "*batch M N"]:
-    """Multiply int8 matrices: int32 where the processor is quick at it, else float32, exact for sums up to 2^24."""
+    """Multiply int8 matrices: int32 where the processor is quick at it, else float32, exact for sums up to 2^24.
+
+    `out`, int32, is for processors that are quick at it: new pages of memory cost as much as the products.
+    """
     if int8_matmul is None or not _fast_int8(left.device) or 0 in (*left.shape, *right.shape):
         return left.float() @ right.float()
-    batch = left.shape[:-2]
-    pairs = zip(left.reshape(-1, *left.shape[-2:]), right.reshape(-1, *right.shape[-2:]), strict=True)
-    products = [int8_matmul(*pair) for pair in pairs]
-    stacked = products[0] if len(products) == 1 else torch.stack(products)
-    return stacked.view(*batch, *products[0].shape)
+    if out is None:
+        out = left.new_empty(*left.shape[:-1], right.shape[-1], dtype=torch.int32)
+    matrices = (values.view(-1, *values.shape[-2:]) for values in (left, right, out))
+    for one, other, product in zip(*matrices, strict=True):
+        int8_matmul(one, other, out=product)
+    return out
 
 
 def _fast_int8(device: torch.device) -> bool:
@@ -305,16 +309,20 @@ def _nearest_by_bytes(
     numbers = torch.arange(pairs.columns, dtype=torch.int32, device=bytes_2.device)
     numbers = (1 << _INDEX_BITS) - 1 - numbers
 
+    at_once = 256  # 128 are as fast, 512 take 1.4 times as long
+    room = numbers.new_empty(len(bytes_1), min(at_once, pairs.rows), pairs.columns)
+
     def keys_of(chunk: slice) -> Tensor:
-        return int8_product(bytes_1[:, chunk], bytes_2.mT).mul_(1 << _INDEX_BITS).add_(numbers)
+        keys = room[:, : chunk.stop - chunk.start]
+        int8_product(bytes_1[:, chunk], bytes_2.mT, out=keys)
+        return torch.add(numbers, keys, alpha=1 << _INDEX_BITS, out=keys)
 
     def distance(keys: Tensor, otherwise: float) -> Tensor:
         columns = zip(descriptors_2, _column_of(keys, lowest, _INDEX_BITS), strict=True)
         chosen = torch.stack([own.index_select(0, at) for own, at in columns])
         return torch.where(keys > lowest, 1 - (descriptors_1 * chosen).sum(-1), otherwise)
 
-    # 128 rows at once are as fast as 256, 512 take 1.4 times as long.
-    best, column, second, of_column = pairs.best(keys_of, lowest, 256, _INDEX_BITS, True)
+    best, column, second, of_column = pairs.best(keys_of, lowest, at_once, _INDEX_BITS, True)
     mutual = best >> _INDEX_BITS >= of_column >> _INDEX_BITS
     return pairs.neighbors(column, distance(best, 1.0), best > lowest, mutual, distance(second, torch.inf))
 
