@@ -36,6 +36,12 @@ hypothesis.settings.register_profile("short", max_examples=40)  # others in each
 hypothesis.settings.load_profile("short")
 
 
+def pytest_sessionstart() -> None:
+    from torchslam.utils.memory import keep_freed_memory  # not before jaxtyping adds its checks
+
+    keep_freed_memory()
+
+
 def pytest_runtest_setup() -> None:
     shapes.start_test()
 

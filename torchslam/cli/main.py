@@ -21,6 +21,7 @@ from typing import Any, NoReturn, TextIO
 import torchslam
 from torchslam.errors import TorchslamError
 from torchslam.utils.console import printable, say, with_install_hint, without_credentials
+from torchslam.utils.memory import keep_freed_memory
 
 ERROR = 2
 """Exit status of an error, as of argparse."""
@@ -100,7 +101,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             gc.freeze()
             gc.enable()
         if options.command not in WITHOUT_THREADS:
-            _compute_in_one_thread()
+            _prepare_to_compute()
         return options.execute(options)
     except (TorchslamError, OSError) as error:
         if isinstance(error, BrokenPipeError) and (abandoned := _flushed(0)):
@@ -142,11 +143,11 @@ class Version(argparse.Action):
         parser.exit()
 
 
-def _compute_in_one_thread() -> None:
-    """Use one thread: the tensors of a frame are too small for more. OMP_NUM_THREADS may ask PyTorch for more.
+def _prepare_to_compute() -> None:
+    """Use one thread, and keep freed memory: the tensors of a frame are small and many.
 
-    OpenCV does not read it; a thread of OpenCV would keep workers from being forks, and still run while the process
-    exits.
+    OMP_NUM_THREADS may ask PyTorch for more threads. OpenCV does not read it; a thread of OpenCV would keep workers
+    from being forks, and still run while the process exits.
     """
     import cv2  # both after the arguments were checked
     import torch
@@ -154,6 +155,7 @@ def _compute_in_one_thread() -> None:
     if "OMP_NUM_THREADS" not in os.environ:
         torch.set_num_threads(1)
     cv2.setNumThreads(1)
+    keep_freed_memory()
 
 
 def load_command(name: str) -> tuple[str, Callable[..., None], Callable[..., int]]:

@@ -35,6 +35,7 @@ import torch
 from torch import Tensor
 
 from torchslam.utils.forks import close_decoders
+from torchslam.utils.memory import keep_freed_memory
 
 RESPONSE_TIMEOUT_S = 60.0
 """A worker that was stopped is given up after this time; a frame or a local adjustment takes less than a second."""
@@ -333,6 +334,7 @@ def _serve_in_fork(theirs: Connection, ours: Connection, task: bytes) -> None:
 
 def _serve_when_imported(connection: Connection) -> None:
     """Answer calls in a new interpreter, which has imported everything to find this function."""
+    keep_freed_memory()
     connection.send_bytes(b"")
     _serve(connection, connection.recv_bytes())
 

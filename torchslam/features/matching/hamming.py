@@ -118,7 +118,9 @@ def sign_products(
 
 
 def int8_product(
-    left: Int[Tensor, "*batch M K"], right: Int[Tensor, "*batch K N"], out: Int[Tensor, "*batch M N"] | None = None
+    left: Int[Tensor, "*batch M K"],
+    right: Int[Tensor, "*batch K N"],
+    out: Int[Tensor, "*batch M N"] | None = None,
 ) -> Num[Tensor, "*batch M N"]:
     """Multiply int8 matrices: int32 where the processor is quick at it, else float32, exact for sums up to 2^24.
 
