@@ -18,7 +18,7 @@ from torchslam.global_mapping import recording
 from torchslam.global_mapping.check import Break, BreakKind, MapCheck
 from torchslam.global_mapping.recording import MappedRun, Mapping, check_run, map_recording, with_doubts
 from torchslam.system.run import Run
-from torchslam.types import Reason, State, StepResult, Trajectory
+from torchslam.types import Explanation, Reason, State, StepResult, Trajectory
 
 
 @dataclass(frozen=True)
@@ -166,6 +166,26 @@ def test_a_recording_with_lost_frames_is_mapped_as_a_whole(world: World, online:
     assert (kept.kept is Mapping.GLOBAL) == bool(why)
     assert (kept.results is world.whole.results) == bool(why)
     assert world.checked_online == (not why)
+
+
+def test_a_camera_that_stands_still_is_not_mapped(world: World) -> None:
+    """But for one that asks for it, or where one frame shows something else."""
+    first, still = Explanation(Reason.NEW_REFERENCE), Explanation.of(Reason.STATIONARY, pixels=0.5)
+    reasons = [first, *[still] * 9]
+    online = a_run(posed=0, failure="the camera stands still")
+    online.results[:] = [
+        StepResult(index, index / 30, State.INITIALIZING, None, reasons=(why,))
+        for index, why in enumerate(reasons)
+    ]
+    kept = world.map(online)
+    assert (kept.kept, kept.why, kept.check, world.mapped) == (Mapping.ONLINE, "", None, [])
+    assert kept.results is online.results
+    world.map(online, Mapping.GLOBAL)
+    assert len(world.mapped) == 1
+    for moving in (Explanation(Reason.PURE_ROTATION), first):
+        online.results[4] = replace(online.results[4], reasons=(moving,))
+        world.map(online)
+    assert len(world.mapped) == 3
 
 
 def test_a_run_that_the_check_contradicts_is_mapped_as_a_whole(world: World) -> None:

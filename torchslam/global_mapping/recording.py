@@ -237,6 +237,8 @@ def map_recording(
         features: those that were extracted before, by `features_to_keep`; None: there are none.
         processes: number of processes, this one included; None: the best number. The result is the same.
     """
+    if mapping is Mapping.AUTO and stands_still(online.results):
+        return MappedRun.of(online, Mapping.ONLINE)
     check, camera = None, camera.to(device)
     why = _loss(online) if go_on is None else f"tracking was lost at frame {online.results[-1].index}"
     if not why or mapping is Mapping.ONLINE:
@@ -294,6 +296,12 @@ def map_recording(
     if is_better:
         return MappedRun.of(made.run, Mapping.GLOBAL, whole, why, online)
     return MappedRun.of(online, Mapping.ONLINE, before, why)
+
+
+def stands_still(results: list[StepResult]) -> bool:
+    """Whether every frame shows the same as the first one, so that no way of mapping has a baseline to map from."""
+    reasons = [each.reason for result in results for each in result.reasons]
+    return len(reasons) > 1 and reasons == [Reason.NEW_REFERENCE] + [Reason.STATIONARY] * (len(results) - 1)
 
 
 def _loss(run: Run) -> str:
