@@ -212,6 +212,41 @@ def close(found, expected):
     torch.testing.assert_close(found, expected, rtol=0, atol=1e-13)
 
 
+def test_a_window_is_a_graph_of_its_own(tmp_path):
+    """With the rows that the definition names, in order, and gradients that reach the pixels of the whole."""
+    _, graph = simulated(frames=20, points=60)
+    first, last = float(graph.timestamps[5]), float(graph.timestamps[15])
+    pixels = graph.pixels.clone().requires_grad_()
+    window = replace(graph, pixels=pixels).window(first, last)
+    assert torch.equal(window.T_cw, graph.T_cw[5:16])
+    assert torch.equal(window.is_keyframe, graph.is_keyframe[5:16])
+    keyframes = [frame for frame in range(5, 16) if graph.is_keyframe[frame]]
+    sees = [set(graph.point_index[graph.frame_index == frame].tolist()) for frame in keyframes]
+    points = [point for point in range(60) if sum(point in each for each in sees) >= 2]
+    assert torch.equal(window.points_w, graph.points_w[points])
+    ends = zip(graph.frame_index.tolist(), graph.point_index.tolist(), strict=True)
+    rows = [row for row, (frame, point) in enumerate(ends) if 5 <= frame <= 15 and point in points]
+    assert torch.equal(window.pixels, graph.pixels[rows])
+    assert torch.equal(window.frame_index + 5, graph.frame_index[rows])
+    assert torch.equal(torch.tensor(points)[window.point_index], graph.point_index[rows])
+    (gradient,) = torch.autograd.grad(solved_graph(window).trajectory.positions_w[-1].sum(), pixels)
+    assert gradient[rows].abs().sum() > 0
+    gradient[rows] = 0
+    assert gradient.abs().sum() == 0
+
+
+def test_a_window_of_all_frames_has_the_same_solution():
+    _, graph = simulated()
+    whole = graph.window(-1.0, 100.0)
+    assert torch.equal(solved_graph(whole).T_cw, solved_graph(graph).T_cw)
+    joined = concatenate_graphs(
+        [graph, replace(graph, timestamps=graph.timestamps + 10, submap=graph.submap + 4)]
+    )
+    assert joined.window(0.0, 5.0).submaps == [0]
+    with pytest.raises(ValueError, match="no two keyframes of a submap from 3 to 4 s"):
+        graph.window(3.0, 4.0)
+
+
 def test_submaps_are_solved_independently():
     _, (one, two), both = two_submaps()
     assert both.submaps == [1, 4]

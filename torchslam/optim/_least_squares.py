@@ -15,7 +15,7 @@ from torch.func import grad, jvp
 from torchslam.geometry.precision import check_dtypes, full_precision
 from torchslam.geometry.robust import Kernel, kernel_scale, robustify
 from torchslam.optim._core import tangent
-from torchslam.optim._core.implicit import Ndims, Tensors, find_minimum, tensors_closed_over
+from torchslam.optim._core.implicit import Minimization, Ndims, Tensors, find_minimum, tensors_closed_over
 from torchslam.optim._core.levenberg_marquardt import (
     LEAST_SQUARES_OPTIONS,
     Convergence,
@@ -311,7 +311,7 @@ class _Problem:
         return Linearization(residual, J, 0.5 * rho, weights * slope, 2 * weights * weights * curvature)
 
 
-class _Minimization:
+class _Minimization(Minimization):
     """`minimize` for `find_minimum`; inputs are the start, then what `_Problem` has; vectors (B, n)."""
 
     num_vectors = 1

@@ -19,7 +19,7 @@ from torchslam.geometry.camera import Camera
 from torchslam.geometry.lie import transform
 from torchslam.geometry.precision import full_precision
 from torchslam.geometry.robust import kernel_scale
-from torchslam.optim._core.implicit import Ndims, Tensors, find_minimum
+from torchslam.optim._core.implicit import Minimization, Ndims, Tensors, find_minimum
 from torchslam.optim._core.levenberg_marquardt import (
     POSE_OPTIONS,
     Convergence,
@@ -173,7 +173,7 @@ class PoseProblem:
         return result if self.prior is None else result + prior_hessian(self.prior, T_cw)
 
 
-class PoseMinimization:
+class PoseMinimization(Minimization):
     """`solve_pose` for `find_minimum`: found are the poses, `success`, and how it went.
 
     Inputs are the start, points, pixels, weights, camera.params, scale, and where there is a prior its two tensors.

@@ -31,7 +31,7 @@ from torchslam.geometry.lie import (
 )
 from torchslam.geometry.precision import full_precision
 from torchslam.geometry.robust import Kernel, Robustified, kernel_scale, robustify
-from torchslam.optim._core.implicit import Ndims, Tensors, find_minimum
+from torchslam.optim._core.implicit import Minimization, Ndims, Tensors, find_minimum
 from torchslam.optim._core.levenberg_marquardt import (
     POSE_GRAPH_OPTIONS,
     Convergence,
@@ -448,7 +448,7 @@ def linearize_edges(
     return EdgeLinearization(error, J, carry, weighted_residual, squared, robust, rest)
 
 
-class PoseGraphMinimization:
+class PoseGraphMinimization(Minimization):
     """A pose graph of inputs `PoseGraphInputs`. Found are nodes, `success`, what moved (B, K), and how it went; vectors
     are (B, K, D)."""
 

@@ -167,6 +167,31 @@ class ObservationGraph:
         columns = {name: moved(name, getattr(self, name)) for name in self.columns()}
         return replace(self, camera=camera(self.camera), calibration=given, readout=readout, **columns)
 
+    def window(self, first: float, last: float) -> Self:
+        """The frames from one time to another, seconds, and the points that at least two of their keyframes see.
+
+        A graph of its own, solved with the memory of its own observations, which carries gradients to all columns of
+        this one. Submaps that have fewer than two keyframes there are left out.
+
+        Raises ValueError where none is left.
+        """
+        frames = (self.timestamps >= first) & (self.timestamps <= last)
+        numbers, submap = torch.unique(self.submap, return_inverse=True)
+        keyframes = torch.bincount(submap[frames & self.is_keyframe], minlength=len(numbers))
+        frames = frames & (keyframes >= 2)[submap]
+        if not bool(frames.any()):
+            raise ValueError(f"no two keyframes of a submap from {first:g} to {last:g} s")
+        of_keyframe = (frames & self.is_keyframe)[self.frame_index]
+        seen = torch.bincount(self.point_index[of_keyframe], minlength=len(self.points_w))
+        points = seen >= 2
+        rows = frames[self.frame_index] & points[self.point_index]
+        chosen = {"frame_index": rows, "point_index": rows, "pixels": rows, "weights": rows}
+        chosen |= {"keypoint_index": rows, "points_w": points, "point_ids": points}
+        columns = {name: getattr(self, name)[chosen.get(name, frames)] for name in self.columns()}
+        for name, kept in (("frame_index", frames), ("point_index", points)):
+            columns[name] = (kept.cumsum(0) - 1)[columns[name]]
+        return replace(self, **columns)
+
     def save(self, path: str | Path) -> None:
         """Write to a safetensors file, atomically; equal graphs give equal bytes."""
         tensors = {name: getattr(self, name).detach().cpu().contiguous() for name in self.columns()}

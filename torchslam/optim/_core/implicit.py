@@ -10,7 +10,7 @@ networks", 2021.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from functools import wraps
 from typing import Any, Literal, ParamSpec, Protocol, TypeVar
@@ -80,6 +80,10 @@ class Minimization(Protocol):
     def slope(self, found: Tensors, inputs: Tensors, direction: Tensors) -> Tensor:
         """() the derivative g . direction of the cost."""
         ...
+
+    def slopes(self, found: Tensors, inputs: Tensors, direction: Tensors) -> Iterator[Tensor]:
+        """Parts of `slope`, which sum to it and have no graph in common: one in memory at a time."""
+        yield self.slope(found, inputs, direction)
 
     def retracted(self, found: Tensors, direction: Tensors) -> Tensors:
         """Return `found` with theta moved along a direction."""
@@ -209,6 +213,16 @@ class _Closed:
         with exchange:
             return self.problem.slope(found, inputs, direction)
 
+    def slopes(self, found: Tensors, inputs: Tensors, direction: Tensors) -> Iterator[Tensor]:
+        inputs, exchange = self._split(inputs)
+        parts = self.problem.slopes(found, inputs, direction)
+        while True:
+            with exchange:  # not while the caller uses a part
+                part = next(parts, None)
+            if part is None:
+                return
+            yield part
+
     def _split(self, inputs: Tensors) -> tuple[Tensors, AbstractContextManager[Any]]:
         """The inputs of the problem itself, and the context in which the others stand in for what is closed over."""
         inputs, others = _split(inputs, len(inputs) - len(self.tensors))
@@ -247,7 +261,8 @@ class _Minimum(torch.autograd.Function):
         if not torch.is_grad_enabled() and not in_transform():
             vector = problem.pull_back(found, tuple(gradient[: problem.num_unknowns]))
             direction = problem.factorized(found, inputs)(vector)
-            return None, *_last_gradient(lambda x: -problem.slope(found, x, direction), inputs, needed)
+            opposite = tuple(-part for part in direction)
+            return None, *_last_gradient(lambda x: problem.slopes(found, x, opposite), inputs, needed)
         right = problem.pull_back(found, gradient[: problem.num_unknowns])
         direction = _solve(problem, right, found, inputs)
         return None, *_gradient(lambda x: -problem.slope(found, x, direction), inputs, needed)
@@ -381,15 +396,20 @@ def _curvature_of(
 
 
 def _last_gradient(
-    function: Callable[[Tensors], Tensor], tensors: Tensors, needed: Sequence[bool]
+    parts: Callable[[Tensors], Iterable[Tensor]], tensors: Tensors, needed: Sequence[bool]
 ) -> list[Tensor | None]:
-    """The gradient to the tensors that need it, itself without graph: the cheap way."""
+    """The gradient of a sum of parts to the tensors that need it, itself without graph: the cheap way."""
     leaves = tuple(x.detach().requires_grad_(need) for x, need in zip(tensors, needed, strict=True))
-    with torch.enable_grad():
-        value = function(leaves)
     wanted = [leaf for leaf in leaves if leaf.requires_grad]
-    grads = iter(torch.autograd.grad(value, wanted, allow_unused=True))
-    return [next(grads) if need else None for need in needed]
+    sums: list[Tensor | None] = [None] * len(wanted)
+    with torch.enable_grad():
+        for part in parts(leaves):
+            grads = torch.autograd.grad(part, wanted, allow_unused=True) if part.requires_grad else ()
+            for row, found in enumerate(grads):
+                before = sums[row]
+                sums[row] = before if found is None else found if before is None else before.add_(found)
+    each = iter(sums)
+    return [next(each) if need else None for need in needed]
 
 
 def _gradient(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -13,7 +13,7 @@ from torch import Tensor
 
 from torchslam.geometry.camera import Camera
 from torchslam.geometry.precision import full_precision
-from torchslam.optim._core.implicit import Ndims, Tensors, find_minimum
+from torchslam.optim._core.implicit import Minimization, Ndims, Tensors, find_minimum
 from torchslam.optim._core.levenberg_marquardt import (
     BUNDLE_OPTIONS,
     Convergence,
@@ -52,8 +52,8 @@ from torchslam.optim.bundle._problem import (
     sanitized,
     select_moving,
 )
-from torchslam.optim.bundle._schur import Marginals
-from torchslam.optim.bundle._sparse import SparseBundle, SparseLayout, build_sparse_layout
+from torchslam.optim.bundle._schur import AT_ONCE, Marginals
+from torchslam.optim.bundle._sparse import SparseBundle, SparseLayout, build_sparse_layout, runs_of
 from torchslam.utils.indexing import row_numbers
 
 # Frame-point pairs of the dense problems solved at once: they fit the cache of a CPU, or keep a GPU busy.
@@ -247,7 +247,7 @@ class BatchPart(NamedTuple):
     layout: SparseLayout | DenseLayout
 
 
-class BundleMinimization:
+class BundleMinimization(Minimization):
     """Bundle adjustments of inputs `BundleData`.
 
     Vectors are frames (B, K, 6), points (B, N, 3) and cameras (B, C n): along the directions (P, n) in which each may
@@ -325,38 +325,20 @@ class BundleMinimization:
         return solve
 
     def slope(self, found: Tensors, inputs: Tensors, direction: Tensors) -> Tensor:
-        frames, points, camera = direction
         found, given = BundleMinimum(*found), BundleData(*inputs)
-        at = self.at_minimum(found, given)
-        in_frames = flat_rows(given.frame_index, given.T_cw.shape[1])
-        in_points = flat_rows(given.point_index, given.points_w.shape[1])
-        T_cw = at.T_cw.flatten(0, 1).index_select(0, in_frames)
-        seen = at.points_w.flatten(0, 1).index_select(0, in_points)[..., None]
-        points_c = (T_cw[:, :3, :3] @ seen).squeeze(-1) + T_cw[:, :3, 3]
-        cameras, in_cameras = self.camera.with_params(at.params.flatten(0, 1)), None
-        if len(cameras.params) > 1:
-            in_cameras = flat_rows(given.camera_of, at.params.shape[1])
-        observed = ReprojectionData(
-            given.pixels.flatten(0, 1),
-            only(found.used, given.weights).flatten(0, 1),
-            cameras[0 if in_cameras is None else in_cameras],
-            self.options.kernel,
-            given.scale[:, None].expand_as(given.counted).flatten(),
-        )
-        is_free = self.free_camera is not False
-        lin = linearize(observed, points_c, is_free)
-        velocity = move(points_c, frames.flatten(0, 1).index_select(0, in_frames))
-        moving = points.flatten(0, 1).index_select(0, in_points)[..., None]
-        velocity = velocity + (T_cw[:, :3, :3] @ moving).squeeze(-1)
-        if is_free:
-            turning = self._along(camera, at.params).flatten(0, 1)
-            turning = turning.expand(len(velocity), -1) if in_cameras is None else turning[in_cameras]
-            velocity = torch.cat((velocity, turning), dim=-1)
-        slope = (lin.gradient_wrt_residual[:, None, :] @ lin.J @ velocity[..., None]).sum()
-        if given.depths.shape[1]:
-            counted = torch.where(found.used, given.depth_information, 0.0).flatten()
-            terms = depth_terms(given.depths.flatten(), counted, points_c[:, 2], exact=False)
-            slope = slope + (terms.slope * velocity[:, 2]).sum()
+        return self._slope(found, given, direction, slice(None))
+
+    def slopes(self, found: Tensors, inputs: Tensors, direction: Tensors) -> Iterator[Tensor]:
+        found, given = BundleMinimum(*found), BundleData(*inputs)
+        for run in runs_of(given.counted.numel(), AT_ONCE):
+            yield self._slope(found, given, direction, run)
+
+    def _slope(self, found: BundleMinimum, given: BundleData, direction: Tensors, run: slice) -> Tensor:
+        """The part of the slope of some observations; with the first ones that of factors and priors."""
+        slope = self._slope_of_observations(found, given, direction, run)
+        if run.start:
+            return slope
+        (frames, points, camera), at = direction, self.at_minimum(found, given)
         if self.kinds:
             moved = found.moved_frames[..., None], found.moved_points[..., None]
             of_frames, of_points = (
@@ -370,6 +352,42 @@ class BundleMinimization:
         priors = prior_terms(given, at.T_cw, at.params, found.moved_frames, directions, exact=False)
         slope = slope + (priors.frames_gradient * frames).sum()
         return slope + (priors.cameras_gradient.flatten(1) * camera).sum()
+
+    def _slope_of_observations(
+        self, found: BundleMinimum, given: BundleData, direction: Tensors, run: slice
+    ) -> Tensor:
+        frames, points, camera = direction
+        at = self.at_minimum(found, given)
+        in_frames = flat_rows(given.frame_index, given.T_cw.shape[1])[run]
+        in_points = flat_rows(given.point_index, given.points_w.shape[1])[run]
+        T_cw = at.T_cw.flatten(0, 1).index_select(0, in_frames)
+        seen = at.points_w.flatten(0, 1).index_select(0, in_points)[..., None]
+        points_c = (T_cw[:, :3, :3] @ seen).squeeze(-1) + T_cw[:, :3, 3]
+        cameras, in_cameras = self.camera.with_params(at.params.flatten(0, 1)), None
+        if len(cameras.params) > 1:
+            in_cameras = flat_rows(given.camera_of, at.params.shape[1])[run]
+        observed = ReprojectionData(
+            given.pixels.flatten(0, 1)[run],
+            only(found.used, given.weights).flatten(0, 1)[run],
+            cameras[0 if in_cameras is None else in_cameras],
+            self.options.kernel,
+            given.scale[:, None].expand_as(given.counted).flatten()[run],
+        )
+        is_free = self.free_camera is not False
+        lin = linearize(observed, points_c, is_free)
+        velocity = move(points_c, frames.flatten(0, 1).index_select(0, in_frames))
+        moving = points.flatten(0, 1).index_select(0, in_points)[..., None]
+        velocity = velocity + (T_cw[:, :3, :3] @ moving).squeeze(-1)
+        if is_free:
+            turning = self._along(camera, at.params).flatten(0, 1)
+            turning = turning.expand(len(velocity), -1) if in_cameras is None else turning[in_cameras]
+            velocity = torch.cat((velocity, turning), dim=-1)
+        slope = (lin.gradient_wrt_residual[:, None, :] @ lin.J @ velocity[..., None]).sum()
+        if given.depths.shape[1]:
+            counted = torch.where(found.used, given.depth_information, 0.0).flatten()[run]
+            terms = depth_terms(given.depths.flatten()[run], counted, points_c[:, 2], exact=False)
+            slope = slope + (terms.slope * velocity[:, 2]).sum()
+        return slope
 
     def retracted(self, found: Tensors, direction: Tensors) -> Tensors:
         frames, points, camera = direction

@@ -207,6 +207,14 @@ class SparseModel:
 
 
 _ALL = slice(None)
+EXACT_AT_ONCE = 1 << 14
+"""Observations of which second derivatives are computed at once, 130 MB. All 81,000 of garden at once take 950 MB, and
+as long."""
+
+
+def runs_of(count: int, size: int) -> list[slice]:
+    """Runs of `size` of `count` observations; one where there are none."""
+    return [slice(start, start + size) for start in range(0, max(count, 1), size)]
 
 
 class Seen(NamedTuple):
@@ -249,7 +257,7 @@ class SparseBundle:
         if len(given.depths):
             information = given.depth_information.index_select(0, rows)
             self.depths = given.depths.index_select(0, rows), information
-        self.runs = [slice(at, at + AT_ONCE) for at in range(0, max(len(rows), 1), AT_ONCE)]
+        self.runs = runs_of(len(rows), AT_ONCE)
         self.inner_points = layout.free_points  # that may take steps of their own
         for kind in self.kinds:
             self.inner_points = self.inner_points.index_fill(0, kind.points.flatten(), False)
@@ -573,18 +581,29 @@ class SparseBundle:
 
         kept: `_linearized` of all observations, if it is known
         """
-        layout, size = self.layout, 3 + (0 if self.directions is None else self.directions.shape[1])
-        gradient = estimate.points_w.new_empty(size, len(layout.observations))
-        hessian, rays_w = gradient.new_empty(size, *gradient.shape), torch.empty_like(gradient[:3])
-        for run in self.runs if kept is None else [_ALL]:
+
+        def expanded(run: slice) -> tuple[Seen, Expansion]:
             seen, lin = kept or self._linearized(estimate, run)
             J = self._in_world(lin.J.movedim(0, -1), seen.R_cw)
             expansion = gauss_newton_expansion(lin, J, use_curvature)
             if self.depths is not None:
                 expansion = with_depths(expansion, self._depth_terms(seen, run, share), seen.R_cw[2])
-            gradient[:, run], hessian[..., run], rays_w[:, run] = *expansion, seen.rays_w
+            return seen, expansion
+
+        return self._assembled(self.runs if kept is None else [_ALL], expanded, exact=False)
+
+    def _assembled(
+        self, runs: Sequence[slice], expanded: Callable[[slice], tuple[Seen, Expansion]], exact: bool
+    ) -> NormalEquations:
+        """The equations of the observations, which are expanded in runs."""
+        layout, size = self.layout, 3 + (0 if self.directions is None else self.directions.shape[1])
+        gradient = self.start.points_w.new_empty(size, len(layout.observations))
+        hessian, rays_w = gradient.new_empty(size, *gradient.shape), torch.empty_like(gradient[:3])
+        for run in runs:
+            seen, (gradient[:, run], hessian[..., run]) = expanded(run)
+            rays_w[:, run] = seen.rays_w
         expansion = Expansion(gradient, hessian)
-        return assemble_sparse(layout.structure, expansion, rays_w, layout.free_points, exact=False)
+        return assemble_sparse(layout.structure, expansion, rays_w, layout.free_points, exact)
 
     def _depth_terms(
         self, seen: Seen, run: slice, share: Tensor | float = 1.0, exact: bool = False
@@ -594,17 +613,17 @@ class SparseBundle:
         return depth_terms(depths[run], share * information[run], seen.points_c[:, 2], exact)
 
     def _exact_equations(self, estimate: BundleEstimate) -> NormalEquations:
-        seen = self._seen(estimate)
-        R_cw, rays_w, points_c = seen
-        observations, is_free = self._observations(estimate), self.directions is not None
-        gradient, hessian = exact_expansion(observations, points_c, is_free)
-        half = self._in_world(hessian.movedim(0, -1), R_cw).transpose(0, 1)
-        expansion = Expansion(self._in_world(gradient.mT[None], R_cw)[0], self._in_world(half, R_cw))
-        if self.depths is not None:
-            terms = self._depth_terms(seen, _ALL, exact=True)
-            expansion = with_depths(expansion, terms, R_cw[2])
-        layout = self.layout
-        equations = assemble_sparse(layout.structure, expansion, rays_w, layout.free_points, exact=True)
+        def expanded(run: slice) -> tuple[Seen, Expansion]:
+            seen, observations = self._seen(estimate, run), self._observed(estimate.params, run)
+            gradient, hessian = exact_expansion(observations, seen.points_c, self.directions is not None)
+            half = self._in_world(hessian.movedim(0, -1), seen.R_cw).transpose(0, 1)
+            gradient = self._in_world(gradient.mT[None], seen.R_cw)[0]
+            expansion = Expansion(gradient, self._in_world(half, seen.R_cw))
+            if self.depths is not None:
+                expansion = with_depths(expansion, self._depth_terms(seen, run, exact=True), seen.R_cw[2])
+            return seen, expansion
+
+        equations = self._assembled(runs_of(len(self.pixels), EXACT_AT_ONCE), expanded, exact=True)
         return _with_priors(equations, self._priors(estimate, "exact"))
 
 
