@@ -276,12 +276,13 @@ def test_some_frames_can_be_posed_and_kept_as_given(mapped: GlobalMap) -> None:
     """Poses of another program: keyframes keep those of the map, frames in between are results as given."""
     mapper = GlobalMapper(WALK, WALK.camera, config(), None)
     pairs = [pair for row, pair in enumerate(mapped.pairs) if row not in mapped.held_back]
-    found = mapper.reconstruct(mapped.views, pairs)
+    views = [view for each in mapped.views if (view := mapper.view(each.index)) is not None]
+    found = mapper.reconstruct(views, pairs)
     assert not isinstance(found, str)
     frames = [0, 1, 2, 3, 6, 9]
     given_cw = true_T_cw(WALK)[frames] @ so3_rigid(0.3)
     by_frame = dict(zip(frames, given_cw, strict=True))
-    run = mapper.finish(mapped.views, *found, frames=frames, given_cw=by_frame, keep=True)
+    run = mapper.adjusted(*mapper.posed(views, *found, frames=frames, given_cw=by_frame), keep=True)
     assert [each.index for each in run.results] == frames
     torch.testing.assert_close(
         torch.stack([each.T_cw for each in run.results if each.T_cw is not None]), given_cw
@@ -290,7 +291,7 @@ def test_some_frames_can_be_posed_and_kept_as_given(mapped: GlobalMap) -> None:
     assert run.map.num_keyframes == 15
     torch.testing.assert_close(run.map.T_cw, found[2].T_cw[found[0]], atol=0, rtol=0)
     assert (run.given, run.calibration) == (None, None)
-    adjusted = mapper.finish(mapped.views, *found, frames=frames)
+    adjusted = mapper.adjusted(*mapper.posed(views, *found, frames=frames))
     assert not torch.equal(adjusted.map.T_cw, found[2].T_cw[found[0]])
 
 
@@ -557,8 +558,10 @@ def test_given_poses_are_those_of_their_frames() -> None:
     """Also after a frame that cannot be read."""
     mapper = GlobalMapper(Damaged(walk_arc(30), {3}), WALK.camera, config(), None)
     made = mapper.run()
-    found = mapper.reconstruct(made.views, made.pairs)
+    views = [view for each in made.views if (view := mapper.view(each.index)) is not None]
+    found = mapper.reconstruct(views, made.pairs)
     assert not isinstance(found, str)
-    run = mapper.finish(made.views, *found, frames=[2, 3, 4], given_cw=dict(enumerate(true_T_cw(WALK))))
+    given_cw = dict(enumerate(true_T_cw(WALK)))
+    run = mapper.adjusted(*mapper.posed(views, *found, frames=[2, 3, 4], given_cw=given_cw))
     assert [each.index for each in run.results] == [2, 4]
     torch.testing.assert_close(run.results[1].T_cw, true_T_cw(WALK)[4])

@@ -7,8 +7,7 @@ the files of single keyframes into one, and `DepthMaps.blocks` reads a few keyfr
 from __future__ import annotations
 
 import json
-import struct
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,7 +19,8 @@ from torch import Tensor
 
 from torchslam.errors import ResultsError
 from torchslam.geometry import Camera
-from torchslam.utils.files import check_regular, parse_json, write_whole
+from torchslam.utils.files import check_regular, parse_json
+from torchslam.utils.tensor_file import TYPES, Blocks, write_tensors
 
 FORMAT = 1
 """Number of the file format."""
@@ -33,7 +33,6 @@ FIELDS = {
 }
 """Tensors of the file that have a row per keyframe, and their types."""
 CAMERA = "camera.params"
-_NAMES = {torch.int64: "I64", torch.float32: "F32", torch.float64: "F64"}  # of types, in a safetensors file
 
 
 @dataclass(frozen=True)
@@ -67,8 +66,8 @@ class DepthMaps:
             about: what a program wants to know again (`read_about`), as JSON.
         """
         columns = {name: getattr(self, name) for name in FIELDS}
-        shapes = {name: tuple(rows.shape) for name, rows in columns.items()}
-        write_whole(path, _content(shapes, lambda name: iter([columns[name]]), self.camera, about or {}))
+        blocks = {name: Blocks(FIELDS[name], tuple(rows.shape), [rows]) for name, rows in columns.items()}
+        _write(path, blocks, self.camera, about or {})
 
     @classmethod
     def load(cls, path: str | Path) -> DepthMaps:
@@ -158,36 +157,18 @@ def join(path: str | Path, parts: Sequence[str | Path]) -> None:
             with _opened(part) as (file, _):
                 yield file.get_tensor(name)
 
-    write_whole(path, _content(shapes, rows, camera, {}))
+    _write(path, {name: Blocks(FIELDS[name], shapes[name], rows(name)) for name in FIELDS}, camera, {})
 
 
-def _content(
-    shapes: dict[str, tuple[int, ...]],
-    rows: Callable[[str], Iterator[Tensor]],
-    camera: Camera,
-    about: dict[str, Any],
-) -> Iterator[bytes]:
-    """The bytes of a file, in pieces: a header with the place of each tensor, then the rows of each, in blocks."""
+def _write(path: str | Path, blocks: dict[str, Blocks], camera: Camera, about: dict[str, Any]) -> None:
+    """Write the columns of depth maps."""
+    params = camera.params.double()
     description = {
         "format": FORMAT,
         "camera": {"model": camera.model, "size": list(camera.size)},
         "about": about,
     }
-    header: dict[str, Any] = {"__metadata__": {"torchslam": json.dumps(description, sort_keys=True)}}
-    end = 0
-    # Wide types first, so that every tensor begins at a multiple of its item size.
-    names = sorted(FIELDS, key=lambda name: -FIELDS[name].itemsize)
-    types = {CAMERA: torch.float64} | {name: FIELDS[name] for name in names}
-    for name, dtype in types.items():
-        shape = tuple(camera.params.shape) if name == CAMERA else shapes[name]
-        start, end = end, end + dtype.itemsize * torch.Size(shape).numel()
-        header[name] = {"dtype": _NAMES[dtype], "shape": list(shape), "data_offsets": [start, end]}
-    text = json.dumps(header).encode()
-    text += b" " * (-len(text) % 8)
-    yield struct.pack("<Q", len(text)) + text
-    for name, dtype in types.items():
-        for block in iter([camera.params]) if name == CAMERA else rows(name):
-            yield block.detach().to("cpu", dtype).contiguous().numpy().tobytes()
+    write_tensors(path, {**blocks, CAMERA: params}, {"torchslam": json.dumps(description, sort_keys=True)})
 
 
 @contextmanager
@@ -242,6 +223,6 @@ def _check_shapes(file: Any, about: dict[str, Any]) -> None:
         CAMERA: [4],
     }
     for name, shape in expected.items():
-        found, dtype = file.get_slice(name), _NAMES[FIELDS.get(name, torch.float64)]
+        found, dtype = file.get_slice(name), TYPES[FIELDS.get(name, torch.float64)]
         if found.get_shape() != shape or found.get_dtype() != dtype:
             raise ValueError(f"{name}: {found.get_dtype()} {found.get_shape()}, expected {dtype} {shape}")

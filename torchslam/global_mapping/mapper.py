@@ -92,7 +92,7 @@ class GlobalMap:
 
     Attributes:
         run: a run like any other; without a submap where `run.failure` has the reason.
-        views: features of the images that were mapped, by row, learned ones included.
+        views: features of the images that were mapped, by row, learned ones included; without descriptors.
         pairs: all verified pairs of them.
         held_back: rows of the held-out pairs.
         doubtful: frames of images that only learned features hold, in a map that pairs contradict somewhere.
@@ -216,7 +216,7 @@ class GlobalMapper:
         self.sequence = source(sequence, self.config, self.camera)
         self.extract: Extractor | None = None
         if not self.sequence.brings_features:
-            self.extract = kept or image_extractor(self.config, device, extractor)
+            self.extract = kept.taken if kept else image_extractor(self.config, device, extractor)
         self.matcher = make_matcher(self.config.matching, None, camera.size, self.config.features.kind)
         self.progress = progress
         self.saved = saved or SavedStages(None, self.sequence, config)
@@ -264,7 +264,11 @@ class GlobalMapper:
                     added = set(tied[0].tolist()) - set(found[0].tolist())
                     doubtful = frozenset() if after.is_right else frozenset(views[row].index for row in added)
                     found, views, pairs, held_back = tied, learned.views, every, left_out
-        run = self.finish(views, *found)
+        posed = self.posed(views, *found)
+        # Nothing is matched from here on, and descriptors are most of the memory.
+        views = [replace(view, descriptors=view.descriptors.new_empty(len(view.mask), 0)) for view in views]
+        del matcher, found, learned
+        run = self.adjusted(*posed)
         return GlobalMap(run, views, pairs, held_back, doubtful)
 
     def _check(
@@ -380,7 +384,7 @@ class GlobalMapper:
     def _log(self, words: str) -> None:
         self.progress(words, 0, 1)
 
-    def finish(
+    def posed(
         self,
         views: list[FrameFeatures],
         rows: Int[Tensor, " K"],
@@ -388,9 +392,8 @@ class GlobalMapper:
         found: Reconstruction,
         frames: Rows[int] | None = None,
         given_cw: dict[int, Float[Tensor, "4 4"]] | None = None,
-        keep: bool = False,
-    ) -> Run:
-        """The map of the posed views, the other frames, and the final adjustment of all.
+    ) -> tuple[Atlas, SensorModel, list[StepResult]]:
+        """The map of the posed views, and the other frames in it, before the final adjustment.
 
         Args:
             views: of the mapped images.
@@ -398,7 +401,6 @@ class GlobalMapper:
             observed, found: the tracks, and poses, camera and points.
             frames: to be posed, all if None.
             given_cw: poses of these frames by another program, by frame.
-            keep: keep poses and camera as they are, those of frames between as given, instead of adjusting them.
         """
         atlas = Atlas(self.camera.params)
         submap = atlas.create()
@@ -414,7 +416,12 @@ class GlobalMapper:
         followed = self._followed(views, submap.map)
         every = self._all_views(range(len(self.sequence)) if frames is None else frames, views, followed)
         again = None if followed is None else followed.again
-        results = pose_frames(submap, every, sensor, self.config, given_cw, again)
+        return atlas, sensor, pose_frames(submap, every, sensor, self.config, given_cw, again)
+
+    def adjusted(
+        self, atlas: Atlas, sensor: SensorModel, results: list[StepResult], keep: bool = False
+    ) -> Run:
+        """The run of posed frames after the final adjustment; `keep`: with poses and camera as they are, instead."""
         final = FinalAdjustment(sensor, self.config, self.given, self.sequence.zoom)
         if not keep:
             final.adjust(atlas, 0, partial(self.progress, "final adjustment"), settled=True)

@@ -8,7 +8,6 @@ from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import safetensors.torch
 import torch
 from jaxtyping import Float, Int, Shaped
 from safetensors import SafetensorError, safe_open
@@ -16,7 +15,8 @@ from torch import Tensor
 
 from torchslam.errors import ResultsError
 from torchslam.optim import PoseGraph
-from torchslam.utils.files import check_regular, parse_json, write_whole
+from torchslam.utils.files import check_regular, parse_json
+from torchslam.utils.tensor_file import write_tensors
 
 PREFIX = "loops."
 """Prefix of the tensors of loops in a file."""
@@ -119,8 +119,7 @@ def unpack_closures(
 def write_closures(path: str | Path, closures: Sequence[LoopClosureRecord]) -> None:
     """Write records as a safetensors file, atomically; equal records give equal bytes."""
     tensors, about = pack_closures(closures)
-    tensors = {name: rows.cpu().clone().contiguous() for name, rows in tensors.items()}
-    write_whole(path, safetensors.torch.save(tensors, {"loops": json.dumps(about)}))
+    write_tensors(path, tensors, {"loops": json.dumps(about)})
 
 
 def read_closures(path: str | Path) -> list[LoopClosureRecord]:

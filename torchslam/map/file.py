@@ -24,7 +24,8 @@ from torchslam.map.atlas import Atlas, Submap
 from torchslam.map.map import Map
 from torchslam.map.table import FRAMES, KEYFRAMES, OBSERVATIONS, POINTS, Schema, Table
 from torchslam.map.unit import MetricUnit
-from torchslam.utils.files import check_regular, parse_json, write_whole
+from torchslam.utils import tensor_file
+from torchslam.utils.files import check_regular, parse_json
 
 FORMAT = 2
 """Number of the file format; docs/versions.md lists which version reads which."""
@@ -167,11 +168,7 @@ def unpack_submaps(
 
 def write_tensors(path: str | Path, tensors: dict[str, Shaped[Tensor, "..."]], about: dict[str, Any]) -> None:
     """Write tensors and their description as one file, atomically; equal content gives equal bytes."""
-    from safetensors.torch import save
-
-    tensors = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
-    # One metadata entry: several would be written in an order that differs from run to run.
-    write_whole(path, save(tensors, metadata={"torchslam": json.dumps(about, sort_keys=True)}))
+    tensor_file.write_tensors(path, tensors, {"torchslam": json.dumps(about, sort_keys=True)})
 
 
 def read_tensors(path: str | Path) -> tuple[dict[str, Shaped[Tensor, "..."]], dict[str, Any]]:

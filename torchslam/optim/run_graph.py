@@ -20,7 +20,6 @@ from itertools import accumulate
 from pathlib import Path
 from typing import Any, NamedTuple, Self, TypeVar
 
-import safetensors.torch
 import torch
 from jaxtyping import Bool, Float, Int
 from safetensors import SafetensorError, safe_open
@@ -53,7 +52,8 @@ from torchslam.optim.bundle._problem import BundleProblem
 from torchslam.optim.bundle._solve import BundleSolution, solve_bundle
 from torchslam.optim.pose import solve_pose
 from torchslam.types import Trajectory
-from torchslam.utils.files import check_regular, parse_json, write_whole
+from torchslam.utils.files import check_regular, parse_json
+from torchslam.utils.tensor_file import write_tensors
 
 _ABOUT = "graph"
 """Metadata of a file: the camera's model and size, and the variance of the calibration, as JSON."""
@@ -194,18 +194,16 @@ class ObservationGraph:
 
     def save(self, path: str | Path) -> None:
         """Write to a safetensors file, atomically; equal graphs give equal bytes."""
-        tensors = {name: getattr(self, name).detach().cpu().contiguous() for name in self.columns()}
-        tensors["camera"] = self.camera.params.detach().cpu().contiguous()
+        tensors: dict[str, Tensor] = {name: getattr(self, name) for name in self.columns()}
+        tensors["camera"] = self.camera.params
         width, height = self.camera.size
         metadata = {"camera_model": self.camera.model, "camera_size": f"{width} {height}"}
         if (given := self.calibration) is not None:
-            parts = zip(_CALIBRATION, (given.camera.params, given.directions), strict=True)
-            tensors |= {name: part.detach().cpu().clone() for name, part in parts}  # no memory is shared
+            tensors |= zip(_CALIBRATION, (given.camera.params, given.directions), strict=True)
             metadata["observation_variance"] = repr(given.observation_variance)
         if self.readout is not None:
             tensors["readout"] = self.readout.numbers
-        # One metadata entry: several would be written in an order that differs from run to run.
-        write_whole(path, safetensors.torch.save(tensors, {_ABOUT: json.dumps(metadata)}))
+        write_tensors(path, tensors, {_ABOUT: json.dumps(metadata)})
 
     @classmethod
     def load(cls, path: str | Path) -> Self:

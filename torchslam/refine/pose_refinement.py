@@ -271,7 +271,7 @@ class _Refinement:
         known = torch.zeros(len(self.views), dtype=torch.bool, device="cpu")
         known[rows.cpu()] = True
         self.after = self._check(reconstruction.T_cw, known, reconstruction.camera)
-        self.run = self.mapper.finish(self.views, *made, self.frames, self.given)
+        self.run = self.mapper.adjusted(*self.mapper.posed(self.views, *made, self.frames, self.given))
         submap = self.run.submaps[0]
         T_cw = submap.posed_frames.T_cw(submap.map)
         given = self.given_cw[submap.posed_frames.frames["frame_index"]]
@@ -297,7 +297,8 @@ class _Refinement:
         observed = self._tracks()
         found = observed.triangulate(self.T_cw, self.mapper.camera, GATE)
         rows = torch.unique(observed.tracks.view[found.agrees])
-        self.run = self.mapper.finish(self.views, rows, observed, found, self.frames, self.given, keep=True)
+        posed = self.mapper.posed(self.views, rows, observed, found, self.frames, self.given)
+        self.run = self.mapper.adjusted(*posed, keep=True)
         submap = self.run.submaps[0]
         frames = submap.posed_frames.frames
         T_rw = submap.map.T_cw[frames["reference_keyframe"]]

@@ -87,6 +87,12 @@ class KeptFeatures:
             self._of[frame.index] = self._extract(frame)
         return self._of[frame.index]
 
+    def taken(self, frame: Frame) -> Features:
+        """The features of a frame, which are not kept any longer."""
+        features = self(frame)
+        del self._of[frame.index]
+        return features
+
 
 def checked_extractor(config: Config, camera: Camera) -> Extractor:
     """Create the configured extractor, for frames that `check_size` accepts."""

@@ -110,7 +110,7 @@ def _nul(path: str | Path) -> OSError:
     return OSError(errno.EINVAL, "file name contains a NUL character", str(path))
 
 
-def write_whole(path: str | Path, content: bytes | Iterable[bytes]) -> None:
+def write_whole(path: str | Path, content: bytes | Iterable[bytes | memoryview]) -> None:
     """Write a file, or its pieces, under a temporary name, sync it to disk, and rename it to `path`.
 
     An existing file stays unchanged until then. Raises OSError.
