@@ -15,7 +15,7 @@ from torchslam.utils.memory import keep_freed_memory
 kept = keep_freed_memory() if sys.argv[1] == "kept" else False
 before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
 for size in 4 * [20, 24, 28] + 8 * [31]:
-    parts = [torch.zeros(size << 20, dtype=torch.uint8) for _ in range(4)]
+    parts = [torch.zeros(size << 20, dtype=torch.uint8) for _ in range(3)]
     del parts
 print(kept, resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before)
 """

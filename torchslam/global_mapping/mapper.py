@@ -68,6 +68,7 @@ from torchslam.system.front_end import (
 from torchslam.system.run import Run, joined_zoom
 from torchslam.tracking.matcher import DescriptorMatcher, make_matcher, prepare_view
 from torchslam.types import Explanation, Frame, FrameFeatures, Reason, State, StepResult
+from torchslam.utils.memory import return_freed_memory
 
 SIFT_RATIO, SIFT_DISTANCE = 0.64, 0.245
 """Ratio test and largest distance of SIFT's descriptors, as 1 - cosine: COLMAP's 0.8 and 0.7 between unit vectors."""
@@ -245,6 +246,7 @@ class GlobalMapper:
             return self._failed(f"no map: {len(views)} images are too few", views, [])
         matcher = PairMatcher(views, self.camera, self.matcher, self.config)
         pairs = build_view_graph(matcher, partial(self.progress, "matches"), self.saved.pairs)
+        return_freed_memory()
         held_back = choose_held_back(pairs)
         used = [pair for row, pair in enumerate(pairs) if row not in held_back]
         found = self.reconstruct(views, used)
@@ -264,6 +266,7 @@ class GlobalMapper:
                     added = set(tied[0].tolist()) - set(found[0].tolist())
                     doubtful = frozenset() if after.is_right else frozenset(views[row].index for row in added)
                     found, views, pairs, held_back = tied, learned.views, every, left_out
+        return_freed_memory()
         posed = self.posed(views, *found)
         # Nothing is matched from here on, and descriptors are most of the memory.
         views = [replace(view, descriptors=view.descriptors.new_empty(len(view.mask), 0)) for view in views]

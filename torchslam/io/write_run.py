@@ -31,6 +31,7 @@ from torchslam.map.unit import MetricUnit
 from torchslam.metric.camera_path import SINCE_1970
 from torchslam.system.run import Run
 from torchslam.types import StepResult, Trajectory
+from torchslam.utils.memory import return_freed_memory
 
 GEOJSON = "trajectory.geojson"
 GPX = "trajectory.gpx"
@@ -56,6 +57,7 @@ def write_run(
         folder: the results folder.
         plots, viewer: whether to draw the plots and to write the viewer page.
     """
+    return_freed_memory()
     sequence = sequence.unzoomed(run.zoom)
     colorize_points([submap.map for submap in run.submaps], sequence, run.session)
     write_results(run, sequence, metrics, folder)

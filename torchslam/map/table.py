@@ -110,7 +110,7 @@ OBSERVATIONS: Schema = {
 
 
 class Table:
-    """Named columns with one row per item; capacity doubles when it is used up, so appending a row costs O(1).
+    """Named columns with one row per item; capacity grows by half when it is used up, so appending a row costs O(1).
 
     The schema fixes names, shapes and kinds; the first `append` fixes dtypes, device and the sizes that the schema
     leaves open. `table["name"]` is a view of the rows in use: writing into it writes into the table. Appended tensors
@@ -177,6 +177,6 @@ class Table:
         old = self._columns.get(name, values.new_zeros(0, *values.shape[1:]))
         if len(old) >= size:
             return old
-        new = values.new_zeros(max(64, size, 2 * len(old)), *values.shape[1:])
+        new = values.new_zeros(max(64, size, 3 * len(old) // 2), *values.shape[1:])
         new[: self._size] = old[: self._size]
         return new

@@ -22,6 +22,7 @@ from torchslam.optim.run_graph import GraphSolution, RunGraph, keyframe_problem,
 from torchslam.optim.sensor_estimate import SensorPrior, estimate_sensor, graph_evidence
 from torchslam.optim.zoom import find_zoom, with_jumps
 from torchslam.system.online_camera import given_readout
+from torchslam.utils.memory import return_freed_memory
 
 FINAL_CHI_SQUARE = 1.5**2
 """Squared error, in units of the noise that the extractor states, from which on an observation leaves the final map.
@@ -104,6 +105,7 @@ class FinalAdjustment:
         main = atlas.main(session)
         if main is None or not self.is_wanted:
             return
+        return_freed_memory()
         self._progress, self._free = progress, self.prior.camera
         for step in self._steps(settled, is_main=True, may_zoom=session == 0):
             step(main)

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import ctypes
 import sys
+from typing import Any
 
 _TRIM_THRESHOLD, _MMAP_THRESHOLD = -1, -3  # of glibc's mallopt
 KEPT_BYTES = 1 << 27
-"""Freed memory at the end of the heap up to which nothing is given back. By default, garden mapped as a whole takes
-4.9 million pages anew, and 10.6 s in the system; with this .44 million and 2.5 s. With 1 GB it is .34 million, but then a walk of 5,000 frames takes 2.5 GB in place of 1.8."""
+"""Freed memory at the end of the heap up to which nothing is given back. By default, garden mapped as a whole takes 4.9
+million pages anew, and 10.6 s in the system; with this .44 million and 2.5 s. With 1 GB it is .34 million, but a walk
+of 5,000 frames takes 2.5 GB in place of 1.8."""
 HEAP_BYTES = 1 << 25
 """Size below which memory is of the heap: the highest that glibc accepts. Larger tensors are given back at once."""
 
@@ -21,9 +23,22 @@ def keep_freed_memory() -> bool:
     Returns:
         Whether the C library is one that can be told so: glibc, of Linux.
     """
-    if not sys.platform.startswith("linux"):
-        return False
-    mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
-    if mallopt is None:  # musl
+    mallopt = _glibc("mallopt")
+    if mallopt is None:
         return False
     return bool(mallopt(_TRIM_THRESHOLD, KEPT_BYTES)) and bool(mallopt(_MMAP_THRESHOLD, HEAP_BYTES))
+
+
+def return_freed_memory() -> None:
+    """Give freed memory back to the system, also between what is in use: after a stage that needed more than the next.
+
+    After global mapping of courthouse, 1.4 GB become .65 GB, in 10 ms. Without glibc nothing happens.
+    """
+    trim = _glibc("malloc_trim")
+    if trim is not None:
+        trim(0)
+
+
+def _glibc(name: str) -> Any:
+    """A function of glibc; None where the C library has none of this name."""
+    return getattr(ctypes.CDLL(None), name, None) if sys.platform.startswith("linux") else None
