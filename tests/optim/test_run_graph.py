@@ -22,6 +22,7 @@ from torchslam.optim.run_graph import (
     solve_graph,
     solve_graphs,
 )
+from torchslam.utils.memory import available_memory
 
 CONVERGED = {"iterations": 25, "tolerance": 0.0}
 
@@ -245,6 +246,20 @@ def test_a_window_of_all_frames_has_the_same_solution():
     assert joined.window(0.0, 5.0).submaps == [0]
     with pytest.raises(ValueError, match="no two keyframes of a submap from 3 to 4 s"):
         graph.window(3.0, 4.0)
+
+
+def test_a_graph_that_does_not_fit_into_memory_is_refused(monkeypatch):
+    _, graph = simulated()
+    monkeypatch.setattr("torchslam.optim.run_graph.available_memory", lambda: 200_000)
+    count = len(graph.pixels)
+    with pytest.raises(
+        MemoryError, match=rf"{count} observations needs about 0.0 GB.*graph.window\(first, last\)"
+    ):
+        solve_graph(graph)
+    monkeypatch.setattr("torchslam.optim.run_graph.available_memory", lambda: None)
+    assert solve_graph(graph).success.all()
+    monkeypatch.undo()
+    assert available_memory() is None or 1 << 20 < available_memory() < 1 << 50
 
 
 def test_submaps_are_solved_independently():
