@@ -49,6 +49,7 @@ from torchslam.optim.bundle._problem import (
     gauge_motions,
     open_motions,
     prior_terms,
+    stiffness_along,
 )
 from torchslam.optim.bundle._schur import Marginals
 
@@ -500,7 +501,8 @@ class DenseBundle:
             motions = torch.cat((motions, rest), dim=-1)
         with torch.no_grad():
             priors = self._priors(estimate)
-            motions = motions if priors is None else open_motions(motions, priors)
+            if priors is not None:
+                motions = open_motions(motions, stiffness_along(motions, priors.frames))
         return motions.flatten(1, 2)
 
 

@@ -40,6 +40,7 @@ from torchslam.optim.bundle._factors import (
     FrameBlocks,
     PointBlocks,
     depth_terms,
+    errors_along,
     factor_terms,
     scale_step,
     with_depths,
@@ -52,6 +53,7 @@ from torchslam.optim.bundle._problem import (
     gauge_motions,
     open_motions,
     prior_terms,
+    stiffness_along,
 )
 from torchslam.optim.bundle._schur import (
     AT_ONCE,
@@ -250,6 +252,8 @@ class SparseBundle:
             information = given.depth_information.index_select(0, rows)
             self.depths = given.depths.index_select(0, rows), information
         self.runs = [slice(at, at + AT_ONCE) for at in range(0, max(len(rows), 1), AT_ONCE)]
+        self.slots = torch.full_like(given.camera_index, -1)  # of each frame among those that are free
+        self.slots[layout.free_frames] = torch.arange(len(layout.free_frames), device=self.slots.device)
         self.inner_points = layout.free_points  # that may take steps of their own
         for kind in self.kinds:
             self.inner_points = self.inner_points.index_fill(0, kind.points.flatten(), False)
@@ -283,7 +287,7 @@ class SparseBundle:
 
     def step(self, model: SparseModel, damping: Tensor) -> tuple[BundleEstimate, Tensor]:
         equations, estimate = model.equations, model.estimate
-        factorized = equations.factorized(damping, self._gauge(estimate))
+        factorized = equations.factorized(damping, self._gauge(estimate, model.terms))
         step = factorized.solve(equations.gradient)
         predicted_reduction = torch.where(factorized.definite, 0.5 * step.dot(equations.gradient), torch.inf)
         frames = self.layout.free_frames
@@ -372,13 +376,15 @@ class SparseBundle:
             and motions[0].shape[-1] in (1, 7)
             and float(relative_reduction) < _DRIFT_GAIN
         ):
-            of_frames, of_points = motions
-            frames = torch.zeros_like(new.estimate.T_cw[:, :1, 0, None]).repeat(1, 6, of_frames.shape[-1])
-            frames = frames.index_copy(0, self.layout.free_frames, of_frames)
-            of_points = of_points * self.layout.free_points[:, None, None]
-            step = scale_step(new.terms.errors, frames, of_points)
+            step = scale_step(*self._along(new.terms, *motions))
         self.drift_steps = self.drift_steps + 1 if abs(step) > _DRIFT else 0
         return torch.full_like(self.solvable, self._has_drifted)
+
+    def _along(self, terms: PriorTerms, of_frames: Tensor, of_points: Tensor) -> tuple[Tensor, Tensor]:
+        """`errors_along` motions of the free frames (K', 6, g) and of the points (N, 3, g)."""
+        frames = of_frames.new_zeros(len(self.given.T_cw), *of_frames.shape[1:])
+        frames = frames.index_copy(0, self.layout.free_frames, of_frames)
+        return errors_along(terms.errors, frames, of_points * self.layout.free_points[:, None, None])
 
     @property
     def _has_drifted(self) -> bool:
@@ -390,7 +396,7 @@ class SparseBundle:
         """Whether (1,) all that moves is determined, up to the gauge."""
         if self._has_drifted:
             return torch.zeros_like(self.solvable)
-        return model.equations.factorized(gauge=self._gauge(model.estimate)).definite[None]
+        return model.equations.factorized(gauge=self._gauge(model.estimate, model.terms)).definite[None]
 
     def ordered(self, estimate: BundleEstimate) -> BundleEstimate:
         """The estimate of a batch of one in the layout's order."""
@@ -425,19 +431,25 @@ class SparseBundle:
         moved = gauge_motions(T_free, origin), _moved_with_gauge(estimate.points_w, origin)
         return moved[0][..., first:end], moved[1][..., first:end]
 
-    def _gauge(self, estimate: BundleEstimate) -> Tensor | None:
-        """Gauge directions (K', 6, g): those of `_motions` that priors and factors leave open, orthonormal."""
+    def _gauge(self, estimate: BundleEstimate, terms: PriorTerms | None = None) -> Tensor | None:
+        """Gauge directions (K', 6, g): those of `_motions` that priors and factors leave open, orthonormal.
+
+        terms: of `_priors`, if they are known, without the exact Hessian of priors
+        """
         every = self._motions(estimate)
         if every is None:
             return None
         of_frames, of_points = every
         motions = torch.linalg.qr(of_frames.flatten(0, 1)).Q.unflatten(0, (-1, 6))
         with torch.no_grad():
-            priors = self._priors(estimate)
-            if priors is None:
+            terms = self._priors(estimate) if terms is None else terms
+            if terms is None:
                 return motions
-            mixed = torch.linalg.lstsq(of_frames.flatten(0, 1), motions.flatten(0, 1)).solution
-            return open_motions(motions, priors, of_points @ mixed)
+            held = stiffness_along(motions, terms.frames if terms.of_priors is None else terms.of_priors)
+            if terms.errors:
+                mixed = torch.linalg.lstsq(of_frames.flatten(0, 1), motions.flatten(0, 1)).solution
+                held = held + self._along(terms, motions, of_points @ mixed)[1]
+            return open_motions(motions, held)
 
     def _priors(self, estimate: BundleEstimate, curvature: Curvature = "none") -> PriorTerms | None:
         """What priors on free frames (K') and cameras, and factors, add, in the axes of the world."""
@@ -463,8 +475,7 @@ class SparseBundle:
         found = factor_terms(
             self.kinds, estimate, given.measured, given.factor_information, directions, curvature
         )
-        slots = torch.full((len(estimate.T_cw),), -1, device=frames.device)
-        slots[frames] = torch.arange(len(frames), device=frames.device)
+        slots = self.slots
         first, second, blocks = found.between
         joined = (slots[first] >= 0) & (slots[second] >= 0)
         points = found.points
@@ -484,6 +495,7 @@ class SparseBundle:
             between=FrameBlocks(slots[first[joined]], slots[second[joined]], blocks[joined]),
             points=points,
             errors=found.errors,
+            of_priors=terms.frames,
         )
 
     def marginals(self, estimate: BundleEstimate) -> Marginals:
