@@ -107,7 +107,10 @@ class SparseLayout:
 
 
 def build_sparse_layout(
-    given: BundleData, moving: MovingParts, joined: Int[Tensor, "M 2"] | None = None
+    given: BundleData,
+    moving: MovingParts,
+    joined: Int[Tensor, "M 2"] | None = None,
+    free_camera: bool = True,
 ) -> SparseLayout:
     """Order the observations of one problem that count; factors join pairs of frames."""
     counted, free_frames, free_points = moving
@@ -130,7 +133,7 @@ def build_sparse_layout(
     if joined is not None:
         joined = slots[joined[free_frames[joined].all(-1)]]
     cameras = given.camera_index[free], given.camera_index[frames], len(given.params)
-    structure = build_structure(slots[frames], points, num_points, *cameras, joined)
+    structure = build_structure(slots[frames], points, num_points, *cameras, joined, free_camera)
     return SparseLayout(
         rows, frames, points, point_order, point_rank, free, free_points[point_order], structure
     )
@@ -151,8 +154,8 @@ def assemble_sparse(
         exact: include the second-order terms of the rotation, for the exact Hessian
     """
     gradient, hessian = expansion
-    points = structure.sum_by_point(hessian[:3, :3].flatten(0, 1).mT).unflatten(-1, (3, -1))
-    pull = structure.sum_by_point(gradient[:3].mT)
+    of_points = torch.cat((hessian[:3, :3].flatten(0, 1), gradient[:3])).mT
+    points, pull = structure.sum_by_point(of_points).split((9, 3), dim=1)
     eye = torch.eye(3, dtype=rays_w.dtype, device=rays_w.device)[..., None]
     coupling = rays_w.new_zeros(structure.coupling.size, 6)
     sums = list[list[Tensor]]()
@@ -174,15 +177,21 @@ def assemble_sparse(
     upper = torch.cat((moved[..., :3], rotated[..., :3].mT), dim=-1)
     lower = torch.cat((rotated[..., :3], twice), dim=-1)
     rest = torch.cat((moved[..., 3:], rotated[..., 3:]), dim=1)
+    of_cameras = tuple(gradient.new_zeros(len(structure.camera_ends), *(0,) * n) for n in (1, 2))
+    camera_coupling = coupling[:0, :0]
+    if len(gradient) > 3:
+        of_cameras = tuple(structure.sum_by_camera(x) for x in (gradient[3:], hessian[3:, 3:]))
+        of_pairs = structure.sum_by_pair(hessian[:3, 3:].permute(2, 0, 1))
+        camera_coupling = structure.camera_coupling.stored(of_pairs)
     return NormalEquations(
         structure,
-        BundleTangent(rest[..., 0], pull, structure.sum_by_camera(gradient[3:])),
+        BundleTangent(rest[..., 0], pull, of_cameras[0]),
         torch.cat((upper, lower), dim=1),
-        points,
-        structure.sum_by_camera(hessian[3:, 3:]),
+        points.unflatten(-1, (3, 3)),
+        of_cameras[1],
         rest[..., 1:],
         coupling,
-        structure.camera_coupling.stored(structure.sum_by_pair(hessian[:3, 3:].permute(2, 0, 1))),
+        camera_coupling,
         free_points,
     )
 
@@ -408,26 +417,34 @@ class SparseBundle:
         points_w = estimate.points_w.index_select(0, self.layout.point_rank)
         return BundleEstimate(estimate.T_cw[None], points_w[None], estimate.params[None])
 
+    @cached_property
+    def _open_motions(self) -> tuple[int, int, int]:
+        """The first motion of a similarity, of which the scale is the first, that observations and what is fixed allow,
+        the one after the last, and the frame that the scale is about."""
+        layout = self.layout
+        is_anchor = torch.zeros_like(self.slots, dtype=torch.bool)
+        is_anchor[layout.frame_index] = True
+        is_anchor[layout.free_frames] = False
+        anchors = is_anchor.nonzero().flatten().tolist()
+        fixed_points = ~layout.free_points & (layout.structure.by_point.counts > 0)
+        if len(anchors) > 1 or fixed_points.any() or not len(layout.free_frames):
+            return 0, 0, 0
+        has_depths = self.depths is not None and bool((self.depths[1] > 0).any())  # which hold the scale
+        return int(has_depths), 1 if anchors else 7, anchors[0] if anchors else int(layout.free_frames[0])
+
     def _motions(self, estimate: BundleEstimate) -> tuple[Tensor, Tensor] | None:
         """How free frames (K', 6, g) and points (N, 3, g) move with the world, as far as observations and what is fixed
         allow: its scale, all motions of a similarity, or the rigid ones; None where the gauge is fixed.
 
         In the axes of the world, as are all vectors of the equations.
         """
-        layout, T_cw = self.layout, estimate.T_cw
-        is_anchor = torch.zeros(len(T_cw), dtype=torch.bool, device=T_cw.device)
-        is_anchor[layout.frame_index] = True
-        is_anchor[layout.free_frames] = False
-        anchors = T_cw[is_anchor]
-        fixed_points = ~layout.free_points & (layout.structure.by_point.counts > 0)
-        if len(anchors) > 1 or fixed_points.any() or not len(layout.free_frames):
-            return None
-        T_free = T_cw[layout.free_frames]
-        origin = se3_inverse(anchors[0] if len(anchors) else T_free[0])[:3, 3]
-        has_depths = self.depths is not None and bool((self.depths[1] > 0).any())
-        first, end = int(has_depths), 1 if len(anchors) else 7  # depths hold the scale, which comes first
+        first, end, origin_frame = self._open_motions
         if first == end:
             return None
+        T_free, origin = (
+            estimate.T_cw[self.layout.free_frames],
+            se3_inverse(estimate.T_cw[origin_frame])[:3, 3],
+        )
         moved = gauge_motions(T_free, origin), _moved_with_gauge(estimate.points_w, origin)
         return moved[0][..., first:end], moved[1][..., first:end]
 
@@ -586,17 +603,20 @@ class SparseBundle:
         kept: `_linearized` of all observations, if it is known
         """
         layout, size = self.layout, 3 + (0 if self.directions is None else self.directions.shape[1])
-        gradient = estimate.points_w.new_empty(size, len(layout.observations))
-        hessian, rays_w = gradient.new_empty(size, *gradient.shape), torch.empty_like(gradient[:3])
-        for run in self.runs if kept is None else [_ALL]:
+        runs = self.runs if kept is None else [_ALL]
+        if len(runs) > 1:
+            gradient = estimate.points_w.new_empty(size, len(layout.observations))
+            hessian, rays_w = gradient.new_empty(size, *gradient.shape), torch.empty_like(gradient[:3])
+        for run in runs:
             seen, lin = kept or self._linearized(estimate, run)
             J = self._in_world(lin.J.movedim(0, -1), seen.R_cw)
             expansion = gauss_newton_expansion(lin, J, use_curvature)
             if self.depths is not None:
                 expansion = with_depths(expansion, self._depth_terms(seen, run, share), seen.R_cw[2])
-            gradient[:, run], hessian[..., run], rays_w[:, run] = *expansion, seen.rays_w
-        expansion = Expansion(gradient, hessian)
-        return assemble_sparse(layout.structure, expansion, rays_w, layout.free_points, exact=False)
+            if len(runs) > 1:
+                gradient[:, run], hessian[..., run], rays_w[:, run] = *expansion, seen.rays_w
+                seen, expansion = seen._replace(rays_w=rays_w), Expansion(gradient, hessian)
+        return assemble_sparse(layout.structure, expansion, seen.rays_w, layout.free_points, exact=False)
 
     def _depth_terms(
         self, seen: Seen, run: slice, share: Tensor | float = 1.0, exact: bool = False
