@@ -21,15 +21,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchslam.optim._core.linear import (
-    LOWER_3X3,
-    Groups,
-    diagonal_floor,
-    factorize,
-    inverse_roots,
-    lower_times,
-    smallest_pivot,
-)
+from torchslam.optim._core.linear import Groups, diagonal_floor, factorize, inverse_roots, smallest_pivot
 from torchslam.optim.bundle._factors import FrameBlocks, PointBlocks
 from torchslam.optim.bundle._reduced import (
     FRAME_DIMS,
@@ -303,7 +295,7 @@ class NormalEquations:
         orthogonal to it do not change.
         """
         blocks, grown = self.points.permute(1, 2, 0), None if damping is None else damping.reshape(1)
-        root = inverse_roots(blocks, self.free_points, grown).permute(2, 0, 1)
+        root = inverse_roots(blocks, self.free_points, grown).permute(2, 0, 1).contiguous()
         directions = None if gauge is None else gauge.flatten(0, 1)
         find = self._dense if self.structure.pairs is None else self._blocks
         is_small = self.structure.num_linked <= AT_ONCE
@@ -401,9 +393,7 @@ class NormalEquations:
                 more = camera_rows[tile.cameras.members].flatten()
                 of_cameras = self.camera_coupling[tile.cameras.storage].view(count, 3, len(more))
                 rows, coupling = torch.cat((rows, more)), torch.cat((coupling, of_cameras), dim=-1)
-            entries = [root[tile.points, i, j, None] for i, j in LOWER_3X3]
-            whitened = torch.stack(lower_times(entries, coupling.unbind(1)), dim=1)
-            yield TileCoupling(tile.points, rows, whitened.flatten(0, 1))
+            yield TileCoupling(tile.points, rows, (root[tile.points] @ coupling).flatten(0, 1))
 
 
 def _at(rows: Int[Tensor, "M r"], columns: Int[Tensor, "M c"]) -> tuple[Tensor, Tensor]:
