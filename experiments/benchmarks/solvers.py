@@ -8,6 +8,7 @@ FOLDER holds `problems.py`, which makes the fixed problems. Prints a table and w
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -20,7 +21,7 @@ from torch import Tensor
 from experiments.benchmarks.ceres import solve_by_ceres
 from experiments.benchmarks.problems import PEERS, load_problems
 from experiments.common import gradient_error, milliseconds, parser_of, publish_page, table
-from torchslam.geometry import Camera, rigid, so3_exp, transform
+from torchslam.geometry import Camera, rigid, se3_exp, se3_inverse, so3_exp, transform
 from torchslam.geometry.robust import Kernel
 from torchslam.optim import BUNDLE_OPTIONS, POSE_OPTIONS, BundleProblem, solve_bundle, solve_pose
 
@@ -88,6 +89,39 @@ def pose_loss(start: Tensor, points_w, pixels, weights, params, scale, **options
     return (refined.T_cw[:, :3].flatten(1) @ torch.linspace(-1, 1, 12, dtype=torch.float64)).sum()
 
 
+def compare_with_dlt() -> Row:
+    """64 poses of 60 points with the gradient to all pixels, beside the direct linear transform of kornia."""
+    from kornia.geometry.calibration.pnp import solve_pnp_dlt
+
+    generator = torch.Generator().manual_seed(0)
+
+    def normal(*shape: int) -> Tensor:
+        return torch.randn(*shape, generator=generator, dtype=torch.float64)
+
+    T_cw = se3_exp(0.3 * normal(64, 6))
+    points_c = torch.cat((normal(64, 60, 2), (4 + normal(64, 60, 1)).clamp_min(2)), dim=-1)
+    points_w = transform(se3_inverse(T_cw), points_c)
+    pixels = (camera().project(points_c)[0] + 0.5 * normal(64, 60, 2)).requires_grad_()
+    start = se3_exp(0.02 * normal(64, 6)) @ T_cw
+    K = camera().K.expand(64, 3, 3)
+    options = POSE_OPTIONS.replace(kernel="none")
+
+    def ours() -> Tensor:
+        return solve_pose(points_w, pixels, T_cw=start, camera=camera(), options=options).T_cw[:, :3]
+
+    def theirs() -> Tensor:
+        return solve_pnp_dlt(points_w, pixels, K)
+
+    def backward(solve: Callable[[], Tensor]) -> None:
+        pixels.grad = None
+        solve().sum().backward()
+
+    ours_ms, theirs_ms = milliseconds(partial(backward, ours), partial(backward, theirs), repeats=15)
+    off = [float((solve() - T_cw[:, :3]).detach().abs().mean()) for solve in (ours, theirs)]
+    what = f"64 poses of 60 points with backward, least squares: time / kornia's `solve_pnp_dlt` ({theirs_ms:.1f} ms)"
+    return Row(f"{what}; its error / kornia's {off[0] / off[1]:.2f}", f"{ours_ms / theirs_ms:.2f}", "1.2")
+
+
 def benchmark_pose(problems: ModuleType) -> list[Row]:
     start, inputs = pose_inputs(problems, 1)
     leaves = {name: tensor.clone().requires_grad_() for name, tensor in inputs.items()}
@@ -131,6 +165,7 @@ def benchmark_pose(problems: ModuleType) -> list[Row]:
         Row(
             "64 problems in one call: throughput against a loop", f"{loop_ms / together_ms:.1f}", "at least 5"
         ),
+        compare_with_dlt(),
     ]
 
 

@@ -31,6 +31,7 @@ from torchslam.optim import (
     solve_pose,
     solve_pose_graph,
 )
+from torchslam.optim.bundle import _dense
 from torchslam.optim.run_graph import GraphSolution, ObservationGraph, solve_graph
 
 MODELS = ("pinhole", "radial_tangential", "fisheye")
@@ -124,6 +125,12 @@ def solved_graph(
 def minimized(residual: Any, start: Any, *given: Any, **options: Any) -> LeastSquaresSolution:
     """`solve_least_squares` with some options changed."""
     return solve_least_squares(residual, start, *given, options=LEAST_SQUARES_OPTIONS.replace(**options))
+
+
+@pytest.fixture(autouse=True)
+def _single_problems_are_sparse(monkeypatch: pytest.MonkeyPatch) -> None:
+    """So that these tests, most of small problems that suit grids, are of both: batches are dense."""
+    monkeypatch.setattr(_dense, "_CELLS_PER_OBSERVATION_ALONE", 0)
 
 
 @pytest.fixture(params=MODELS)

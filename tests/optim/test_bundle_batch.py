@@ -13,6 +13,7 @@ from torch.func import vmap
 from tests.optim.conftest import adjusted
 from torchslam.geometry import se3_exp
 from torchslam.optim import BUNDLE_OPTIONS, BundleProblem, CameraPrior, PosePrior, solve_bundle
+from torchslam.optim.bundle import _dense
 from torchslam.optim.bundle import _solve as minimization
 from torchslam.optim.bundle._dense import DenseBundle
 from torchslam.optim.bundle._problem import sanitized, select_moving
@@ -102,6 +103,28 @@ def test_a_batch_equals_a_loop_over_its_elements(bundle_scene, model, grids, mon
         monkeypatch.setattr(minimization, "suits_dense", lambda *_: False)
     problems = mixed(bundle_scene, model=model)
     assert_as_alone(batch_of(problems), problems, kernel="cauchy", scale=2.0)
+
+
+def test_a_single_problem_that_suits_a_grid_is_solved_on_one(bundle_scene, monkeypatch):
+    """With the same minimum, gradient and covariances; not if half of its cells are empty."""
+    scene = bundle_scene(frames=5, points=30, fixed_frames=())
+    found = []
+    for most in (0, 1.5):
+        monkeypatch.setattr(_dense, "_CELLS_PER_OBSERVATION_ALONE", most)
+        pixels = scene.problem.pixels.clone().requires_grad_()
+        problem = replace(scene.problem, pixels=pixels)
+        given = sanitized(problem, 1.0)
+        is_dense = minimization.suits_dense(given, select_moving(given))
+        assert is_dense == (most > 0)
+        solution = adjusted(problem, **CONVERGED)
+        loss = solution.points_w.square().sum() + solution.T_cw[1, 0, 3]
+        (gradient,) = torch.autograd.grad(loss, pixels)
+        covariance = solution.covariance()
+        found.append((solution.T_cw, solution.points_w, gradient, covariance.frames, covariance.points))
+    for one, other in zip(*found, strict=True):
+        torch.testing.assert_close(one, other, **EQUAL)
+    given = sanitized(bundle_scene(frames=9, points=30, visible=0.2).problem, 1.0)
+    assert not minimization.suits_dense(given, select_moving(given))
 
 
 def test_exact_data_are_solved_to_rounding(bundle_scene, model):

@@ -33,6 +33,8 @@ from torchslam.mapping import local_bundle, mapper
 from torchslam.system import map_start, state_machine
 from torchslam.system.checkpoint import read_checkpoint, write_checkpoint
 from torchslam.system.online_run import Observer, OnlineRun, RunProgress
+from torchslam.tracking.motion_model import constant_velocity
+from torchslam.types import MotionHistory, PosePrediction
 
 SETTINGS = ["features.kind=simulated", "features.num_keypoints=250", "simulated.points_per_view=150"]
 # Without any noise, what a run says of its camera would be looked for to the last bit, in hundreds of iterations.
@@ -207,6 +209,41 @@ def test_damaged_checkpoints_are_refused(
     write_tensors(tmp_path / "damaged", tensors, about)
     with pytest.raises(ResultsError, match=f"damaged: not a whole checkpoint: .*({message})"):
         read_checkpoint(tmp_path / "damaged", WALK, CONFIG)
+
+
+def test_a_checkpoint_of_another_version_is_named(checkpoint: Path, tmp_path: Path) -> None:
+    """With the last motion in the place of several, and without a number, as it was; or of a later version."""
+    tensors, about = read_tensors(checkpoint)
+    tensors["run.tracking.velocity"] = tensors.pop("run.tracking.motions")[-1]
+    del tensors["run.tracking.intervals"]
+    for found in (None, 3):
+        about["run"].pop("format", None)
+        about["run"] |= {} if found is None else {"format": found}
+        write_tensors(tmp_path / "other", tensors, about)
+        with pytest.raises(ResultsError, match=f"other: checkpoint format {found or 1}, .*: run again"):
+            read_checkpoint(tmp_path / "other", WALK, CONFIG)
+
+
+class Steady:
+    """A motion model that is an object, with a state that is empty at first."""
+
+    def __init__(self) -> None:
+        self.seen: list[MotionHistory] = []
+
+    def __len__(self) -> int:
+        return len(self.seen)
+
+    def __call__(self, history: MotionHistory) -> PosePrediction:
+        self.seen.append(history)
+        return constant_velocity(history)
+
+
+def test_a_motion_model_that_is_an_object_goes_on(checkpoint: Path) -> None:
+    whole, model = SLAM(WALK.camera, CONFIG).run(WALK), Steady()
+    slam, so_far = read_checkpoint(checkpoint, WALK, CONFIG, motion_model=model)
+    resumed = OnlineRun(slam, WALK, so_far).run()
+    assert len(model) >= FRAMES - so_far.next
+    assert torch.equal(resumed.trajectory.T_wc, whole.trajectory.T_wc)
 
 
 def test_a_checkpoint_needs_a_confirmed_map(tmp_path: Path) -> None:

@@ -42,8 +42,8 @@ from torchslam.optim._core.residuals import (
 )
 from torchslam.optim._core.tangent import (
     PosePrior,
+    cross_entries,
     move,
-    point_jacobian,
     prior_expansion,
     prior_hessian,
     pull_back,
@@ -163,8 +163,13 @@ class PoseProblem:
         """The exact Hessian (B, 6, 6) of the cost in xi."""
         points_c = transform(T_cw, self.points_w)
         gradient, hessian = exact_expansion(self.observations, points_c)
-        G = point_jacobian(points_c)
-        result = G.flatten(-3, -2).mT @ (hessian @ G).flatten(-3, -2)
+        blocks = hessian.movedim((-2, -1), (0, 1))  # (3, 3, B, N)
+        rays = points_c.movedim(-1, 0).contiguous()
+        turned = torch.stack(cross_entries(rays, blocks))
+        twice = torch.stack(cross_entries(rays, turned.transpose(0, 1)))
+        own, turned, twice = (part.sum(-1).movedim(-1, 0) for part in (blocks, turned, twice))
+        rows = torch.cat((own, turned.mT), dim=-1), torch.cat((turned, twice), dim=-1)
+        result = torch.cat(rows, dim=-2)
         # The curvature of the rotation itself: half of gradient . (omega x (omega x p)).
         outer = gradient.mT @ points_c
         trace = outer.diagonal(dim1=-2, dim2=-1).sum(-1)[:, None, None]
@@ -224,8 +229,8 @@ class PoseMinimization(Minimization):
         T_cw, (xi,), (points_w, observations, prior) = found[0], direction, self._given(inputs)
         points_c = transform(T_cw, points_w)
         lin = linearize(observations, points_c)
-        velocity = lin.J @ move(points_c, xi[:, None])[..., None]
-        slope = (lin.gradient_wrt_residual[..., None, :] @ velocity).sum()
+        pulled = (lin.gradient_wrt_residual[..., None] * lin.J).sum(-2)
+        slope = (pulled * move(points_c, xi[:, None])).sum()
         if prior is not None:
             slope = slope + (prior_expansion(prior, T_cw)[1] * xi).sum()
         return slope

@@ -31,13 +31,15 @@ from torchslam.system.online_camera import CameraChange
 from torchslam.system.online_run import RunProgress
 from torchslam.system.session import Session
 from torchslam.system.slam import SLAM
-from torchslam.types import Explanation, Reason, State, StepResult
+from torchslam.types import Explanation, MotionModel, Reason, State, StepResult
 from torchslam.utils.files import fingerprint
 
 STATES = tuple(State)
 """The order of states in a file."""
 TRACKING = "run.tracking."
 """Prefix of the tensors of the tracking state."""
+FORMAT = 2
+"""Of the state of a run; 1, without a number, had the last motion alone, `velocity`."""
 UNKNOWN = "not a whole checkpoint"
 """What errors say of a damaged file."""
 
@@ -57,6 +59,7 @@ def write_checkpoint(path: str | Path, slam: SLAM, so_far: RunProgress, sequence
     results, reasons, stages = _packed(so_far.results)
     loops, closures = pack_closures(slam.loop_closer.loop_closures)
     about["run"] = {
+        "format": FORMAT,
         "sequence": input_hash(sequence),
         "config": input_hash(slam.config),
         "next": so_far.next,
@@ -97,24 +100,32 @@ def read_checkpoint(
     config: Config,
     device: torch.device | str = "cpu",
     extractor: FeatureExtractor | None = None,
+    motion_model: MotionModel | None = None,
 ) -> tuple[SLAM, RunProgress]:
     """Read the system and the progress of its run from a checkpoint.
 
+    extractor, motion_model: those that `SLAM` was given; the configured ones if None
+
     Raises:
-        ResultsError: if the file is missing or damaged, or belongs to a run over another sequence or with another
-            configuration.
+        ResultsError: if the file is missing or damaged, was written by another version, or belongs to a run over
+            another sequence or with another configuration.
     """
     tensors, about = read_tensors(path)
     run = about.pop("run", None)
     if not isinstance(run, dict):
         raise ResultsError(f"{path}: a map, but not a checkpoint")
+    if run.get("format", 1) != FORMAT:
+        found = run.get("format", 1)
+        raise ResultsError(
+            f"{path}: checkpoint format {found}, this version reads format {FORMAT}: run again"
+        )
     for what, mine in (("sequence", sequence), ("config", config)):
         if run.get(what) != input_hash(mine):
             word = "configuration" if what == "config" else what
             raise ResultsError(f"{path}: a checkpoint of a run with another {word}")
     own = {name: tensors.pop(name) for name in list(tensors) if name.startswith("run.")}
     saved = unpack_submaps(path, tensors, about, device)
-    slam = SLAM(saved.camera, config, extractor)
+    slam = SLAM(saved.camera, config, extractor, motion_model=motion_model)
     try:
         so_far = RunProgress(run["next"], _results(own, run, device), run["skipped"])
         slam.zoom = None if run["zoom"] is None else Zoom.from_plain(run["zoom"])

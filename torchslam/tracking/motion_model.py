@@ -39,14 +39,16 @@ BUILT_IN: dict[str, MotionModel] = {"constant-velocity": constant_velocity, "con
 
 def make_motion_model(config: Config, model: MotionModel | None = None) -> MotionModel:
     """The given model, or else the configured one. Raises ConfigError if it cannot be loaded."""
+    if model is not None:
+        return model
     name = "constant-pose" if config.paper.brute_force else config.tracking.motion_model
-    return model or BUILT_IN.get(name) or load(MOTION_MODELS, name)
+    return BUILT_IN.get(name) or load(MOTION_MODELS, name)
 
 
 def run_motion_model(model: MotionModel, history: MotionHistory) -> PosePrediction:
     """Run a motion model; raises ConfigError where it predicts no pose, or something that is no covariance."""
     found: Any = model(history)
-    if model in BUILT_IN.values():
+    if any(model is each for each in BUILT_IN.values()):
         return found
     name = getattr(model, "__name__", type(model).__name__)
     if not isinstance(found, PosePrediction):

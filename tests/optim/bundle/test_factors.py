@@ -16,6 +16,7 @@ from torchslam.optim import (
     relative_pose_error,
     solve_bundle,
 )
+from torchslam.optim.bundle import _factors
 from torchslam.optim.bundle.dense_numpy import solve_bundle_numpy
 
 CONVERGED = {"iterations": 100, "tolerance": 1e-18, "strict": True}
@@ -83,6 +84,12 @@ def test_each_determines_the_scale(bundle_scene, kind, fixed):
     assert solution.cost < 1e-9
 
 
+def started_at(solution):
+    """What of a problem makes a solution its start, from which one with other measurements is a few steps away."""
+    camera = solution.camera.with_params(solution.camera.params.detach())
+    return {"T_cw": solution.T_cw.detach(), "points_w": solution.points_w.detach(), "camera": camera}
+
+
 def mixed(scene, frames):
     """A problem with all kinds, with noise, and the tensors that it has gradients to."""
     problem = scene.problem
@@ -93,7 +100,7 @@ def mixed(scene, frames):
         "distances": (pairs[:, 1] - pairs[:, 0]).norm(dim=-1) * (0.05 * draw(len(frames), seed=2)).exp(),
         "distance_information": torch.full((len(frames),), 400.0).double(),
         "depths": depths_of(scene) * (0.1 * draw(len(problem.pixels), seed=3)).exp(),
-        "depth_information": 50 + 50 * torch.rand(len(problem.pixels)).double(),
+        "depth_information": 50 + 50 * draw(len(problem.pixels), seed=8).sigmoid(),
         "heights": 0.01 * draw(len(frames), seed=4),
     }
 
@@ -185,17 +192,24 @@ def test_the_gradient_agrees_with_differences_with_free_camera_and_kernel(bundle
     with_all, tensors = mixed(scene, torch.tensor([(0, 2), (1, 5), (3, 4)]))
     along = torch.tensor([[1.0], [1.0], [0.0], [0.0]]).double()
 
-    def loss(tensors):
+    def solved(tensors, **start):
         options = BUNDLE_OPTIONS.replace(kernel="cauchy", scale=2.0, **CONVERGED)
-        return solve_bundle(with_all(tensors), free_camera=along, options=options).T_cw[5, 0, 3]
+        return solve_bundle(with_all(tensors, **start), free_camera=along, options=options)
+
+    def loss(solution):
+        return solution.T_cw[5, 0, 3]
 
     names = ("T_21", "distances", "depths", "depth_information", "heights")
     leaves = {name: tensors[name].clone().requires_grad_() for name in names}
-    gradients = torch.autograd.grad(loss(tensors | leaves), list(leaves.values()))
+    solution = solved(tensors | leaves)
+    gradients = torch.autograd.grad(loss(solution), list(leaves.values()))
+    near = started_at(solution)
     for name, gradient in zip(names, gradients, strict=True):
-        step = 1e-4 * draw(*gradient.shape, seed=11)
+        step = 1e-4 * tensors[name].abs().mean() * draw(*gradient.shape, seed=11)
         with torch.no_grad():
-            up, down = (loss(tensors | {name: tensors[name] + sign * step}) for sign in (1, -1))
+            up, down = (
+                loss(solved(tensors | {name: tensors[name] + sign * step}, **near)) for sign in (1, -1)
+            )
         torch.testing.assert_close((gradient * step).sum(), 0.5 * (up - down), rtol=1e-3, atol=1e-12)
 
 
@@ -361,8 +375,8 @@ def test_factors_of_all_kinds_have_their_minimum_and_gradient(bundle_scene, fram
     factors, tensors = of_all_kinds(scene)
     focal = torch.tensor([[1.0], [1.0], [0.0], [0.0]]).double()
 
-    def solved(tensors):
-        problem = replace(scene.problem, factors=factors(tensors))
+    def solved(tensors, **start):
+        problem = replace(scene.problem, factors=factors(tensors), **start)
         return adjusted(problem, free_camera=focal, kernel="cauchy", scale=3.0, **CONVERGED)
 
     leaves = {name: tensor.clone().requires_grad_() for name, tensor in tensors.items()}
@@ -375,14 +389,14 @@ def test_factors_of_all_kinds_have_their_minimum_and_gradient(bundle_scene, fram
     )
     gradients = torch.autograd.grad(loss, list(leaves.values()))
     slopes = dict(zip(tensors, gradients, strict=True))
-    groups = 3 if frames < 10 else 1
+    groups, near = 3 if frames < 10 else 1, started_at(solution)
     for names in (list(tensors)[group::groups] for group in range(groups)):
         steps = {name: 1e-4 * draw(*slopes[name].shape, seed=11) for name in names}
         if "T_information" in steps:
             steps["T_information"] = steps["T_information"] + steps["T_information"].mT
         with torch.no_grad():
             up, down = (
-                solved(tensors | {name: tensors[name] + sign * step for name, step in steps.items()})
+                solved(tensors | {name: tensors[name] + sign * step for name, step in steps.items()}, **near)
                 for sign in (1, -1)
             )
         moved = weights[0] * (up.T_cw - down.T_cw), weights[1] * (up.points_w - down.points_w)
@@ -392,3 +406,23 @@ def test_factors_of_all_kinds_have_their_minimum_and_gradient(bundle_scene, fram
     covariance = solution.covariance()
     assert (covariance.frames.diagonal(dim1=1, dim2=2) > 0).all()
     assert (torch.linalg.eigvalsh(covariance.points) > 0).all()
+
+
+@pytest.mark.parametrize("curvature", ["none", "exact"])
+def test_derivatives_in_several_passes_are_those_in_one(bundle_scene, monkeypatch, curvature):
+    """Many factors are differentiated a few components at a time."""
+    scene = bundle_scene(noise=1.0, fixed_frames=())
+    factors, tensors = of_all_kinds(scene)
+    every, problem = factors(tensors), scene.problem
+    packed = _factors.packed_factors(every, problem.T_cw[None], len(problem.points_w))
+    at = problem.T_cw, problem.points_w, problem.camera.params[None]
+    directions = torch.eye(4).double()[:, :2]
+
+    def terms():
+        given = (part[0] for part in packed)
+        return _factors.factor_terms(_factors.factor_kinds(every), at, *given, directions, curvature)
+
+    whole = terms()
+    monkeypatch.setattr(_factors, "_AT_ONCE", 12)
+    for part, expected in zip(terms()[:6], whole[:6], strict=True):
+        torch.testing.assert_close(part, expected, rtol=1e-12, atol=1e-12)

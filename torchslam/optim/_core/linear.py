@@ -56,11 +56,6 @@ class DefiniteFactor:
         solution = scale * torch.cholesky_solve(scale * right, self.factor)
         return torch.where(self.definite[..., None, None], solution, 0.0)
 
-    def inverse_root(self) -> Float[Tensor, "*batch D D"]:
-        """Q with Q^T Q = matrix^-1, zero where the matrix is not definite."""
-        root = torch.linalg.solve_triangular(self.factor, torch.diag_embed(self.scale), upper=False)
-        return torch.where(self.definite[..., None, None], root, 0.0)
-
 
 def factorize(matrix: Float[Tensor, "*batch D D"], strict: bool = True) -> DefiniteFactor:
     """Cholesky factorization that never raises; strict: a matrix is definite only if it is clearly so, beyond
@@ -91,8 +86,9 @@ def inverse_root_3x3(lower: Iterable[Any], mask: Any = True, smallest: float = 0
     def inverse_sqrt(pivot: Any, is_definite: Any) -> Any:
         return 1 / xp.sqrt(xp.where(is_definite, pivot, 1.0))
 
-    is_definite = (b00 > 0) & (b11 > 0) & (b22 > 0) & mask
-    s0, s1, s2 = (inverse_sqrt(pivot, is_definite) for pivot in (b00, b11, b22))
+    diagonal = xp.stack((b00, b11, b22))
+    is_definite = (diagonal > 0).all(0) & mask
+    s0, s1, s2 = inverse_sqrt(diagonal, is_definite)
     l10, l20 = b10 * s1 * s0, b20 * s2 * s0
     pivot = 1 - l10 * l10
     is_definite = is_definite & (pivot > smallest)
@@ -104,6 +100,21 @@ def inverse_root_3x3(lower: Iterable[Any], mask: Any = True, smallest: float = 0
     q10, q20 = -l10 * s0 * i1, -(l20 - l21 * l10 * i1) * s0 * i2
     root = s0, q10, s1 * i1, q20, -l21 * s1 * i1 * i2, s2 * i2
     return [xp.where(is_definite, entry, 0.0) for entry in root]
+
+
+def inverse_roots(
+    blocks: Float[Tensor, "*batch 3 3 N"],
+    mask: Bool[Tensor, "*batch N"],
+    damping: Float[Tensor, "*#batch #N"] | None,
+) -> Float[Tensor, "*batch 3 3 N"]:
+    """`inverse_root_3x3` of blocks whose diagonals grew by the share `damping`; without it, a block is definite only
+    if it is clearly so, as in `factorize`."""
+    grown = 1.0 if damping is None else 1 + damping
+    lower = [blocks[..., i, j, :] * grown if i == j else blocks[..., i, j, :] for i, j in LOWER_3X3]
+    smallest = smallest_pivot(blocks.dtype) ** 2 if damping is None else 0.0
+    q00, q10, q11, q20, q21, q22 = inverse_root_3x3(lower, mask, smallest)
+    zero = torch.zeros_like(q00)
+    return torch.stack((q00, zero, zero, q10, q11, zero, q20, q21, q22), dim=-2).unflatten(-2, (3, 3))
 
 
 def lower_times(q: Any, v: Any) -> list[Any]:

@@ -212,7 +212,12 @@ def gauss_newton_expansion(
     zero (iteratively reweighted least squares), which descends from afar.
     Source: Triggs et al., "Bundle adjustment: a modern synthesis", 1999, section 4.3.
     """
-    curvature_term = flat_along(lin.weight, lin.curvature_term, lin.residual.square().sum(-1), use_curvature)
+    squared = lin.residual.square().sum(-1)
+    return _expansion(lin, J, flat_along(lin.weight, lin.curvature_term, squared, use_curvature))
+
+
+def _expansion(lin: Linearization, J: Float[Tensor, "2 D *batch"], curvature_term: Tensor) -> Expansion:
+    """Gradient (D, ..., N) and Hessian (D, D, ..., N) of the cost, without the curvature of the projection."""
     pulled = (J[0] * lin.residual[..., 0]).addcmul(J[1], lin.residual[..., 1])  # J^T r
     weighted = lin.weight * J
     hessian = (weighted[0][:, None] * J[0]).addcmul(weighted[1][:, None], J[1])
@@ -232,14 +237,12 @@ def exact_expansion(
         expansion = exact_expansion(_apart(observations), points_c[:, None], free_camera)
         return Expansion(*(part.squeeze(1) for part in expansion))
     lin = linearize(observations, points_c, free_camera)
-    gradient_wrt_residual = lin.gradient_wrt_residual[..., None]
-    along = (lin.residual[..., None, :] @ lin.J) * (lin.curvature_term[..., None] * lin.residual)[..., None]
-    hessian = lin.J.mT @ (lin.weight[..., None, None] * lin.J + along)
-    pull = gradient_wrt_residual
+    gradient, hessian = _expansion(lin, lin.J.movedim((-2, -1), (0, 1)), lin.curvature_term)
+    pull = lin.gradient_wrt_residual[..., None]
     if observations.has_matrices:
         pull = whitening(observations.weights).mT @ pull
-    hessian = hessian + _projection_curvature(observations.camera, points_c, pull.detach(), free_camera)
-    return Expansion((lin.J.mT @ gradient_wrt_residual).squeeze(-1), hessian)
+    curvature = _projection_curvature(observations.camera, points_c, pull.detach(), free_camera)
+    return Expansion(gradient.movedim(0, -1), hessian.movedim((0, 1), (-2, -1)) + curvature)
 
 
 def _projection_curvature(
@@ -249,6 +252,14 @@ def _projection_curvature(
     free_camera: bool,
 ) -> Float[Tensor, "*batch N D D"]:
     """sum_k force_k * Hessian of pixel_k in (points_c, camera.params)."""
+    if camera.model == "pinhole" and not free_camera:  # written out: a tenth of the time
+        depth = points_c[..., 2:]
+        inverse = torch.where(depth > torch.finfo(depth.dtype).eps, depth, 1.0).reciprocal()
+        pulls = gradient_wrt_residual[..., 0] * camera.params[..., None, :2] * inverse.square()
+        along = 2 * (pulls * points_c[..., :2] * inverse).sum(-1)
+        (x, y), zero = (-pulls).unbind(-1), torch.zeros_like(along)
+        rows = torch.stack((zero, zero, x, zero, zero, y, x, y, along)).unflatten(0, (3, 3))
+        return rows.movedim((0, 1), (-2, -1))
     with torch.enable_grad():
         points = points_c.detach().clone().requires_grad_()
         variables = [points]

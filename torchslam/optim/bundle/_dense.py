@@ -25,7 +25,7 @@ from torchslam.optim._core.linear import (
     DefiniteFactor,
     diagonal_floor,
     factorize,
-    inverse_root_3x3,
+    inverse_roots,
     lower_times,
 )
 from torchslam.optim._core.residuals import (
@@ -49,6 +49,7 @@ from torchslam.optim.bundle._problem import (
     gauge_motions,
     open_motions,
     prior_terms,
+    stiffness_along,
 )
 from torchslam.optim.bundle._schur import Marginals
 
@@ -75,14 +76,22 @@ class DenseLayout(NamedTuple):
     held_points: Bool[Tensor, " B"]
 
 
+_CELLS_PER_OBSERVATION, _CELLS_PER_OBSERVATION_ALONE = 8, 1.5
+"""Cells of a grid up to which it is faster than sparse equations, in a batch and for a single problem. Tried from 3 to
+24 frames and 50 to 2000 points: alone, full grids take .5 to .9 of the time, half empty ones .8 to 1.1."""
+_MOST_FRAMES_ALONE = 16
+"""Frames of a single problem: with many, sparse equations let points take steps of their own."""
+
+
 def suits_dense(given: BundleData, moving: MovingParts) -> bool:
     """Whether grids are the faster way: no point is seen twice in a frame, and few cells are empty."""
     num_frames, num_points = moving.frames.shape[1], moving.points.shape[1]
     cells = moving.frames.numel() * num_points
     if given.weights.ndim > 2 or given.depths.shape[1] or given.measured.shape[1]:
         return False  # the dense equations take scalar weights only, and neither depths nor factors
-    # An observation of the sparse equations costs as much as 8 cells of a grid.
-    if not 0 < cells <= 8 * int(moving.counted.sum()):
+    alone = len(given.T_cw) == 1
+    most = _CELLS_PER_OBSERVATION_ALONE if alone else _CELLS_PER_OBSERVATION
+    if not 0 < cells <= most * int(moving.counted.sum()) or (alone and num_frames > _MOST_FRAMES_ALONE):
         return False
     places = flat_rows(given.frame_index * num_points + given.point_index, num_frames * num_points)
     return int(torch.bincount(places[moving.counted.flatten()], minlength=1).max()) <= 1
@@ -221,16 +230,6 @@ class FactorizedDense(NamedTuple):
         root = self.root.permute(0, 3, 1, 2)
         inner = torch.eye(3, dtype=A.dtype, device=A.device) + (A @ inverse[:, None]) @ A.mT
         return inverse, root.mT @ inner @ root
-
-
-def _inverse_root(blocks: Tensor, free: Tensor, damping: Tensor | None) -> Tensor:
-    """`inverse_root_3x3` of blocks (B, 3, 3, N), with diagonals grown by the share `damping`, where they are free."""
-    grown = 1.0 if damping is None else 1 + damping[:, None]
-    lower = [blocks[:, i, j] * grown if i == j else blocks[:, i, j] for i, j in LOWER_3X3]
-    smallest = torch.finfo(blocks.dtype).eps ** 0.8 if damping is None else 0.0
-    q00, q10, q11, q20, q21, q22 = inverse_root_3x3(lower, free, smallest)
-    zero = torch.zeros_like(q00)
-    return torch.stack((q00, zero, zero, q10, q11, zero, q20, q21, q22), dim=1).unflatten(1, (3, 3))
 
 
 class DenseModel(NamedTuple):
@@ -458,7 +457,8 @@ class DenseBundle:
         free, reduced = self.layout.free, equations.reduced
         frames = 6 * free.shape[1]
         more = reduced.shape[-1] - frames
-        root = _inverse_root(equations.points, self.layout.free_points, damping)
+        growth = None if damping is None else damping[:, None]
+        root = inverse_roots(equations.points, self.layout.free_points, growth)
         rows = lower_times([root[:, None, i, j] for i, j in LOWER_3X3], equations.coupling.unbind(2))
         whitened = torch.stack(rows, dim=2).flatten(2)
         if damping is not None:  # a frame that lost all its observations stays solvable: its step is zero
@@ -500,7 +500,8 @@ class DenseBundle:
             motions = torch.cat((motions, rest), dim=-1)
         with torch.no_grad():
             priors = self._priors(estimate)
-            motions = motions if priors is None else open_motions(motions, priors)
+            if priors is not None:
+                motions = open_motions(motions, stiffness_along(motions, priors.frames))
         return motions.flatten(1, 2)
 
 

@@ -325,7 +325,7 @@ def checked_rows(name: str, index: Tensor, shape: tuple[int, ...], size: int) ->
 
 class PriorTerms(NamedTuple):
     """Cost (...), and gradients and Hessians over frames (..., K, 6) and the n free directions of cameras (..., C,
-    n)."""
+    n); with factors what they add, and the Hessian over frames without them."""
 
     cost: Tensor
     frames_gradient: Tensor
@@ -335,6 +335,7 @@ class PriorTerms(NamedTuple):
     between: FrameBlocks | None = None
     points: PointBlocks | None = None
     errors: tuple[LinearErrors, ...] = ()
+    of_priors: Tensor | None = None
 
     def in_world(self, R_cw: Tensor) -> PriorTerms:
         """The same for frames (..., K, 3, 3) that move along the axes of the world."""
@@ -387,21 +388,16 @@ def gauge_motions(T_cw: Float[Tensor, "*batch K 4 4"], origin_w: Tensor) -> Floa
 
 
 def open_motions(
-    motions: Float[Tensor, "*batch K 6 g"], terms: PriorTerms, of_points: Float[Tensor, "N 3 g"] | None = None
+    motions: Float[Tensor, "*batch K 6 g"], held: Float[Tensor, "*batch g g"]
 ) -> Float[Tensor, "*batch K 6 g"]:
-    """Of orthonormal motions (..., K, 6, g) of all frames those that priors and factors do not hinder; else zero.
-
-    of_points: how points move with the frames, where there are factors of points
-    """
-    held = torch.einsum("...fag,...fab,...fbh->...gh", motions, terms.frames, motions)
-    if terms.between is not None:
-        first, second, blocks = terms.between
-        across = torch.einsum("fag,fab,fbh->gh", motions[first], blocks, motions[second])
-        held = held + across + across.mT
-    if terms.points is not None and of_points is not None:
-        held = held + torch.einsum("nag,nab,nbh->gh", of_points, terms.points.diagonal, of_points)
-        joined = torch.cat((motions.flatten(0, 1), of_points.flatten(0, 1)))[terms.points.joined]
-        held = held + joined.mT @ terms.points.matrix @ joined
+    """Of orthonormal motions (..., K, 6, g) of all frames those without a stiffness, `held`; else zero."""
     stiffness, mixtures = torch.linalg.eigh(held)
     is_open = stiffness <= torch.finfo(held.dtype).eps ** 0.5 * stiffness[..., -1:]
     return motions @ (mixtures * is_open[..., None, :])[..., None, :, :]
+
+
+def stiffness_along(
+    motions: Float[Tensor, "*batch K 6 g"], frames: Float[Tensor, "*batch K 6 6"]
+) -> Float[Tensor, "*batch g g"]:
+    """The Hessian along motions of all frames, given the block of each frame."""
+    return (motions.mT @ frames @ motions).sum(-3)

@@ -21,7 +21,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchslam.optim._core.linear import Groups, diagonal_floor, factorize, smallest_pivot
+from torchslam.optim._core.linear import Groups, diagonal_floor, factorize, inverse_roots, smallest_pivot
 from torchslam.optim.bundle._factors import FrameBlocks, PointBlocks
 from torchslam.optim.bundle._reduced import (
     FRAME_DIMS,
@@ -172,10 +172,12 @@ def build_structure(
     camera_of: Int[Tensor, " O"],
     num_cameras: int,
     joined: Int[Tensor, "M 2"] | None = None,
+    free_cameras: bool = True,
 ) -> Structure:
     """The structure of observations in the order of `Structure`, by the slots of their frames, K for all fixed ones.
 
-    cameras: of the free frames; camera_of: of the observations; joined: free frames that factors join
+    cameras: of the free frames; camera_of: of the observations; joined: free frames that factors join; free_cameras:
+    without, no pairs of points and cameras are needed
     """
     num_frames = len(cameras)
     frame_ends = torch.bincount(frame_slots, minlength=num_frames + 1)[:num_frames].cumsum(0).tolist()
@@ -184,6 +186,7 @@ def build_structure(
     coupling, frames_of = _stored(frame_slots[:linked], point_index[:linked], num_frames, num_points, height)
     by_point, pair = Groups.of(point_index, num_points), point_index * num_cameras + camera_of
     order = torch.argsort(pair, stable=True) if num_cameras > 1 else by_point.order
+    order = order if free_cameras else order[:0]
     numbers, counts = torch.unique_consecutive(pair[order], return_counts=True)
     of_pairs = numbers % num_cameras, numbers // num_cameras
     camera_coupling, cameras_of = _stored(*of_pairs, num_cameras, num_points, height)
@@ -291,8 +294,8 @@ class NormalEquations:
         frames, the solution is zero: if they span the null space of the observations, solutions for right sides
         orthogonal to it do not change.
         """
-        root = factorize(_damped(self.points, damping), strict=damping is None).inverse_root()
-        root = torch.where(self.free_points[:, None, None], root, 0.0)
+        blocks, grown = self.points.permute(1, 2, 0), None if damping is None else damping.reshape(1)
+        root = inverse_roots(blocks, self.free_points, grown).permute(2, 0, 1).contiguous()
         directions = None if gauge is None else gauge.flatten(0, 1)
         find = self._dense if self.structure.pairs is None else self._blocks
         is_small = self.structure.num_linked <= AT_ONCE

@@ -16,10 +16,15 @@ from torch import Tensor
 from torchslam.geometry.precision import full_precision
 from torchslam.optim._core.levenberg_marquardt import GRAPH_OPTIONS, SolverOptions
 from torchslam.optim._core.residuals import Linearization, flatness, variance_factor
-from torchslam.optim.bundle._problem import BundleData, BundleEstimate, BundleProblem, sanitized
+from torchslam.optim.bundle._problem import (
+    BundleEstimate,
+    BundleProblem,
+    MovingParts,
+    sanitized,
+    select_moving,
+)
 from torchslam.optim.bundle._schur import BundleTangent, FactorizedEquations, sum_runs
-from torchslam.optim.bundle._solve import BundleMinimization
-from torchslam.optim.bundle._sparse import SparseBundle, SparseLayout
+from torchslam.optim.bundle._sparse import SparseBundle, SparseLayout, build_sparse_layout
 
 
 class CameraScores(NamedTuple):
@@ -257,8 +262,7 @@ def observations_alone(
     directions: in which the parameters of its one camera may move."""
     problem = replace(problem, camera_prior=None, pose_prior=None, depth_prior=None, factors=())
     given = sanitized(problem, options.scale)
-    free = False if directions is None else directions
-    minimization = BundleMinimization(problem.camera, free, options, matrices=given.weights.ndim > 3)
-    ((_, bundle),) = minimization.formulations(BundleData(*given))
-    assert isinstance(bundle, SparseBundle), "one problem is solved by sparse algebra"
+    moving, alone = MovingParts(*(mask[0] for mask in select_moving(given))), given.part(0)
+    layout = build_sparse_layout(alone, moving, free_camera=directions is not None)
+    bundle = SparseBundle(layout, alone, problem.camera, options.kernel, directions, ())
     return bundle, bundle.ordered(BundleEstimate(given.T_cw, given.points_w, given.params))

@@ -463,14 +463,20 @@ class BundleMinimization(Minimization):
         """The layouts for the observations that count; the last ones are kept, which mostly are the next ones."""
         if self._last is None or not torch.equal(self._last[0], given.counted):
             moving = select_moving(given, self.kinds)
-            self._last = given.counted, moving, _parts(given, moving, self.kinds)
+            self._last = (
+                given.counted,
+                moving,
+                _parts(given, moving, self.kinds, self.free_camera is not False),
+            )
         return self._last[1:]
 
 
-def _parts(given: BundleData, moving: MovingParts, kinds: Sequence[FactorKind] = ()) -> list[BatchPart]:
+def _parts(
+    given: BundleData, moving: MovingParts, kinds: Sequence[FactorKind] = (), free_camera: bool = True
+) -> list[BatchPart]:
     """Split a batch into parts: dense, as many problems at once as fit, or sparse, one at a time."""
     batch = len(given.T_cw)
-    use_dense = batch > 1 and suits_dense(given, moving)
+    use_dense = suits_dense(given, moving)
     size = 1
     if use_dense:
         cells = _MAX_CELLS_CPU if given.T_cw.device.type == "cpu" else _MAX_CELLS_GPU
@@ -484,7 +490,7 @@ def _parts(given: BundleData, moving: MovingParts, kinds: Sequence[FactorKind] =
             parts.append(BatchPart(rows, build_dense_layout(given.part(rows), of_part)))
             continue
         of_one = MovingParts(*(mask[0] for mask in of_part))
-        parts.append(BatchPart(rows, build_sparse_layout(given.part(start), of_one, joined)))
+        parts.append(BatchPart(rows, build_sparse_layout(given.part(start), of_one, joined, free_camera)))
     return parts
 
 

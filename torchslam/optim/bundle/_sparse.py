@@ -40,6 +40,7 @@ from torchslam.optim.bundle._factors import (
     FrameBlocks,
     PointBlocks,
     depth_terms,
+    errors_along,
     factor_terms,
     scale_step,
     with_depths,
@@ -52,6 +53,7 @@ from torchslam.optim.bundle._problem import (
     gauge_motions,
     open_motions,
     prior_terms,
+    stiffness_along,
 )
 from torchslam.optim.bundle._schur import (
     AT_ONCE,
@@ -105,7 +107,10 @@ class SparseLayout:
 
 
 def build_sparse_layout(
-    given: BundleData, moving: MovingParts, joined: Int[Tensor, "M 2"] | None = None
+    given: BundleData,
+    moving: MovingParts,
+    joined: Int[Tensor, "M 2"] | None = None,
+    free_camera: bool = True,
 ) -> SparseLayout:
     """Order the observations of one problem that count; factors join pairs of frames."""
     counted, free_frames, free_points = moving
@@ -128,7 +133,7 @@ def build_sparse_layout(
     if joined is not None:
         joined = slots[joined[free_frames[joined].all(-1)]]
     cameras = given.camera_index[free], given.camera_index[frames], len(given.params)
-    structure = build_structure(slots[frames], points, num_points, *cameras, joined)
+    structure = build_structure(slots[frames], points, num_points, *cameras, joined, free_camera)
     return SparseLayout(
         rows, frames, points, point_order, point_rank, free, free_points[point_order], structure
     )
@@ -149,8 +154,8 @@ def assemble_sparse(
         exact: include the second-order terms of the rotation, for the exact Hessian
     """
     gradient, hessian = expansion
-    points = structure.sum_by_point(hessian[:3, :3].flatten(0, 1).mT).unflatten(-1, (3, -1))
-    pull = structure.sum_by_point(gradient[:3].mT)
+    of_points = torch.cat((hessian[:3, :3].flatten(0, 1), gradient[:3])).mT
+    points, pull = structure.sum_by_point(of_points).split((9, 3), dim=1)
     eye = torch.eye(3, dtype=rays_w.dtype, device=rays_w.device)[..., None]
     coupling = rays_w.new_zeros(structure.coupling.size, 6)
     sums = list[list[Tensor]]()
@@ -172,15 +177,21 @@ def assemble_sparse(
     upper = torch.cat((moved[..., :3], rotated[..., :3].mT), dim=-1)
     lower = torch.cat((rotated[..., :3], twice), dim=-1)
     rest = torch.cat((moved[..., 3:], rotated[..., 3:]), dim=1)
+    of_cameras = tuple(gradient.new_zeros(len(structure.camera_ends), *(0,) * n) for n in (1, 2))
+    camera_coupling = coupling[:0, :0]
+    if len(gradient) > 3:
+        of_cameras = tuple(structure.sum_by_camera(x) for x in (gradient[3:], hessian[3:, 3:]))
+        of_pairs = structure.sum_by_pair(hessian[:3, 3:].permute(2, 0, 1))
+        camera_coupling = structure.camera_coupling.stored(of_pairs)
     return NormalEquations(
         structure,
-        BundleTangent(rest[..., 0], pull, structure.sum_by_camera(gradient[3:])),
+        BundleTangent(rest[..., 0], pull, of_cameras[0]),
         torch.cat((upper, lower), dim=1),
-        points,
-        structure.sum_by_camera(hessian[3:, 3:]),
+        points.unflatten(-1, (3, 3)),
+        of_cameras[1],
         rest[..., 1:],
         coupling,
-        structure.camera_coupling.stored(structure.sum_by_pair(hessian[:3, 3:].permute(2, 0, 1))),
+        camera_coupling,
         free_points,
     )
 
@@ -258,6 +269,8 @@ class SparseBundle:
             information = given.depth_information.index_select(0, rows)
             self.depths = given.depths.index_select(0, rows), information
         self.runs = runs_of(len(rows), AT_ONCE)
+        self.slots = torch.full_like(given.camera_index, -1)  # of each frame among those that are free
+        self.slots[layout.free_frames] = torch.arange(len(layout.free_frames), device=self.slots.device)
         self.inner_points = layout.free_points  # that may take steps of their own
         for kind in self.kinds:
             self.inner_points = self.inner_points.index_fill(0, kind.points.flatten(), False)
@@ -291,7 +304,7 @@ class SparseBundle:
 
     def step(self, model: SparseModel, damping: Tensor) -> tuple[BundleEstimate, Tensor]:
         equations, estimate = model.equations, model.estimate
-        factorized = equations.factorized(damping, self._gauge(estimate))
+        factorized = equations.factorized(damping, self._gauge(estimate, model.terms))
         step = factorized.solve(equations.gradient)
         predicted_reduction = torch.where(factorized.definite, 0.5 * step.dot(equations.gradient), torch.inf)
         frames = self.layout.free_frames
@@ -380,13 +393,15 @@ class SparseBundle:
             and motions[0].shape[-1] in (1, 7)
             and float(relative_reduction) < _DRIFT_GAIN
         ):
-            of_frames, of_points = motions
-            frames = torch.zeros_like(new.estimate.T_cw[:, :1, 0, None]).repeat(1, 6, of_frames.shape[-1])
-            frames = frames.index_copy(0, self.layout.free_frames, of_frames)
-            of_points = of_points * self.layout.free_points[:, None, None]
-            step = scale_step(new.terms.errors, frames, of_points)
+            step = scale_step(*self._along(new.terms, *motions))
         self.drift_steps = self.drift_steps + 1 if abs(step) > _DRIFT else 0
         return torch.full_like(self.solvable, self._has_drifted)
+
+    def _along(self, terms: PriorTerms, of_frames: Tensor, of_points: Tensor) -> tuple[Tensor, Tensor]:
+        """`errors_along` motions of the free frames (K', 6, g) and of the points (N, 3, g)."""
+        frames = of_frames.new_zeros(len(self.given.T_cw), *of_frames.shape[1:])
+        frames = frames.index_copy(0, self.layout.free_frames, of_frames)
+        return errors_along(terms.errors, frames, of_points * self.layout.free_points[:, None, None])
 
     @property
     def _has_drifted(self) -> bool:
@@ -398,7 +413,7 @@ class SparseBundle:
         """Whether (1,) all that moves is determined, up to the gauge."""
         if self._has_drifted:
             return torch.zeros_like(self.solvable)
-        return model.equations.factorized(gauge=self._gauge(model.estimate)).definite[None]
+        return model.equations.factorized(gauge=self._gauge(model.estimate, model.terms)).definite[None]
 
     def ordered(self, estimate: BundleEstimate) -> BundleEstimate:
         """The estimate of a batch of one in the layout's order."""
@@ -410,42 +425,56 @@ class SparseBundle:
         points_w = estimate.points_w.index_select(0, self.layout.point_rank)
         return BundleEstimate(estimate.T_cw[None], points_w[None], estimate.params[None])
 
+    @cached_property
+    def _open_motions(self) -> tuple[int, int, int]:
+        """The first motion of a similarity, of which the scale is the first, that observations and what is fixed allow,
+        the one after the last, and the frame that the scale is about."""
+        layout = self.layout
+        is_anchor = torch.zeros_like(self.slots, dtype=torch.bool)
+        is_anchor[layout.frame_index] = True
+        is_anchor[layout.free_frames] = False
+        anchors = is_anchor.nonzero().flatten().tolist()
+        fixed_points = ~layout.free_points & (layout.structure.by_point.counts > 0)
+        if len(anchors) > 1 or fixed_points.any() or not len(layout.free_frames):
+            return 0, 0, 0
+        has_depths = self.depths is not None and bool((self.depths[1] > 0).any())  # which hold the scale
+        return int(has_depths), 1 if anchors else 7, anchors[0] if anchors else int(layout.free_frames[0])
+
     def _motions(self, estimate: BundleEstimate) -> tuple[Tensor, Tensor] | None:
         """How free frames (K', 6, g) and points (N, 3, g) move with the world, as far as observations and what is fixed
         allow: its scale, all motions of a similarity, or the rigid ones; None where the gauge is fixed.
 
         In the axes of the world, as are all vectors of the equations.
         """
-        layout, T_cw = self.layout, estimate.T_cw
-        is_anchor = torch.zeros(len(T_cw), dtype=torch.bool, device=T_cw.device)
-        is_anchor[layout.frame_index] = True
-        is_anchor[layout.free_frames] = False
-        anchors = T_cw[is_anchor]
-        fixed_points = ~layout.free_points & (layout.structure.by_point.counts > 0)
-        if len(anchors) > 1 or fixed_points.any() or not len(layout.free_frames):
-            return None
-        T_free = T_cw[layout.free_frames]
-        origin = se3_inverse(anchors[0] if len(anchors) else T_free[0])[:3, 3]
-        has_depths = self.depths is not None and bool((self.depths[1] > 0).any())
-        first, end = int(has_depths), 1 if len(anchors) else 7  # depths hold the scale, which comes first
+        first, end, origin_frame = self._open_motions
         if first == end:
             return None
+        T_free, origin = (
+            estimate.T_cw[self.layout.free_frames],
+            se3_inverse(estimate.T_cw[origin_frame])[:3, 3],
+        )
         moved = gauge_motions(T_free, origin), _moved_with_gauge(estimate.points_w, origin)
         return moved[0][..., first:end], moved[1][..., first:end]
 
-    def _gauge(self, estimate: BundleEstimate) -> Tensor | None:
-        """Gauge directions (K', 6, g): those of `_motions` that priors and factors leave open, orthonormal."""
+    def _gauge(self, estimate: BundleEstimate, terms: PriorTerms | None = None) -> Tensor | None:
+        """Gauge directions (K', 6, g): those of `_motions` that priors and factors leave open, orthonormal.
+
+        terms: of `_priors`, if they are known, without the exact Hessian of priors
+        """
         every = self._motions(estimate)
         if every is None:
             return None
         of_frames, of_points = every
         motions = torch.linalg.qr(of_frames.flatten(0, 1)).Q.unflatten(0, (-1, 6))
         with torch.no_grad():
-            priors = self._priors(estimate)
-            if priors is None:
+            terms = self._priors(estimate) if terms is None else terms
+            if terms is None:
                 return motions
-            mixed = torch.linalg.lstsq(of_frames.flatten(0, 1), motions.flatten(0, 1)).solution
-            return open_motions(motions, priors, of_points @ mixed)
+            held = stiffness_along(motions, terms.frames if terms.of_priors is None else terms.of_priors)
+            if terms.errors:
+                mixed = torch.linalg.lstsq(of_frames.flatten(0, 1), motions.flatten(0, 1)).solution
+                held = held + self._along(terms, motions, of_points @ mixed)[1]
+            return open_motions(motions, held)
 
     def _priors(self, estimate: BundleEstimate, curvature: Curvature = "none") -> PriorTerms | None:
         """What priors on free frames (K') and cameras, and factors, add, in the axes of the world."""
@@ -471,8 +500,7 @@ class SparseBundle:
         found = factor_terms(
             self.kinds, estimate, given.measured, given.factor_information, directions, curvature
         )
-        slots = torch.full((len(estimate.T_cw),), -1, device=frames.device)
-        slots[frames] = torch.arange(len(frames), device=frames.device)
+        slots = self.slots
         first, second, blocks = found.between
         joined = (slots[first] >= 0) & (slots[second] >= 0)
         points = found.points
@@ -492,6 +520,7 @@ class SparseBundle:
             between=FrameBlocks(slots[first[joined]], slots[second[joined]], blocks[joined]),
             points=points,
             errors=found.errors,
+            of_priors=terms.frames,
         )
 
     def marginals(self, estimate: BundleEstimate) -> Marginals:
@@ -597,6 +626,9 @@ class SparseBundle:
     ) -> NormalEquations:
         """The equations of the observations, which are expanded in runs."""
         layout, size = self.layout, 3 + (0 if self.directions is None else self.directions.shape[1])
+        if len(runs) == 1:
+            seen, expansion = expanded(runs[0])
+            return assemble_sparse(layout.structure, expansion, seen.rays_w, layout.free_points, exact)
         gradient = self.start.points_w.new_empty(size, len(layout.observations))
         hessian, rays_w = gradient.new_empty(size, *gradient.shape), torch.empty_like(gradient[:3])
         for run in runs:
