@@ -628,7 +628,8 @@ class SparseBundle:
         layout, size = self.layout, 3 + (0 if self.directions is None else self.directions.shape[1])
         if len(runs) == 1:
             seen, expansion = expanded(runs[0])
-            return assemble_sparse(layout.structure, expansion, seen.rays_w, layout.free_points, exact)
+            expansion, rays_w = Expansion(*(x.contiguous() for x in expansion)), seen.rays_w.contiguous()
+            return assemble_sparse(layout.structure, expansion, rays_w, layout.free_points, exact)
         gradient = self.start.points_w.new_empty(size, len(layout.observations))
         hessian, rays_w = gradient.new_empty(size, *gradient.shape), torch.empty_like(gradient[:3])
         for run in runs:
