@@ -24,7 +24,13 @@ from torchslam.optim.bundle._problem import (
     select_moving,
 )
 from torchslam.optim.bundle._schur import BundleTangent, FactorizedEquations, sum_runs
-from torchslam.optim.bundle._sparse import SparseBundle, SparseLayout, build_sparse_layout
+from torchslam.optim.bundle._sparse import (
+    EXACT_AT_ONCE,
+    SparseBundle,
+    SparseLayout,
+    build_sparse_layout,
+    runs_of,
+)
 
 
 class CameraScores(NamedTuple):
@@ -77,7 +83,12 @@ def camera_scores(
         torch.stack([column[part] for column in columns], dim=-1) @ block for part in range(2)
     )  # (K', 6, n), (N, 3, n)
     J = J.permute(2, 0, 1)
-    M = J[..., :3] @ _velocities(layout, estimate, rays_w, frames, points) + J[..., 3:]
+    M = torch.cat(
+        [
+            J[run, :, :3] @ _velocities(layout, estimate, rays_w, frames, points, run) + J[run, :, 3:]
+            for run in runs_of(len(J), EXACT_AT_ONCE)
+        ]
+    )
     scores = -(M.mT @ lin.gradient_wrt_residual[..., None])[..., 0]
     unknowns = 6 * len(layout.free_frames) + 3 * int(layout.free_points.sum()) + n
     return CameraScores(
@@ -141,10 +152,13 @@ def focal_scores(
     frames, points = (torch.stack([step[part] for step in steps], dim=-1) for part in range(2))
     camera = torch.stack([step.cameras[0] for step in steps], dim=-1)
     J = J.permute(2, 0, 1)
-    followed = J[..., :3] @ _velocities(layout, estimate, rays_w, frames, points) + J[..., 3:] @ camera
+    slopes = J.new_empty(len(J), 2, shares.shape[1])
+    for run in runs_of(len(J), EXACT_AT_ONCE):
+        followed = J[run, :, :3] @ _velocities(layout, estimate, rays_w, frames, points, run)
+        slopes[run] = J[run, :, 3, None] * share[run, None] - followed - J[run, :, 3:] @ camera
     unknowns = 6 * len(layout.free_frames) + 3 * int(layout.free_points.sum()) + shares.shape[1]
     return FocalScores(
-        J[..., 3, None] * share[:, None] - followed,
+        slopes,
         lin.gradient_wrt_residual,
         lin.weight,
         layout.frame_index,
@@ -159,12 +173,13 @@ def _velocities(
     rays_w: Float[Tensor, "3 O"],
     frames: Float[Tensor, "k 6 n"],
     points: Float[Tensor, "N 3 n"],
-) -> Float[Tensor, "O 3 n"]:
-    """How each of n steps of free frames and points moves the points of observations, seen from their frames."""
+    run: slice,
+) -> Float[Tensor, "R 3 n"]:
+    """How each of n steps of free frames and points moves the points of a run, seen from their frames."""
     moved = frames.new_zeros(len(estimate.T_cw), *frames.shape[1:])
-    moved = moved.index_copy(0, layout.free_frames, frames)[layout.frame_index]
-    rays_w = rays_w.mT[..., None].expand(-1, -1, frames.shape[-1])
-    return moved[:, :3] + torch.linalg.cross(moved[:, 3:], rays_w, dim=1) + points[layout.point_index]
+    moved = moved.index_copy(0, layout.free_frames, frames)[layout.frame_index[run]]
+    rays_w = rays_w[:, run].mT[..., None].expand(-1, -1, frames.shape[-1])
+    return moved[:, :3] + torch.linalg.cross(moved[:, 3:], rays_w, dim=1) + points[layout.point_index[run]]
 
 
 @full_precision
