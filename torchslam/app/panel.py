@@ -26,6 +26,7 @@ TICK_S = 1.0
 CHECK_S = 120.0  # seconds in which a reader is to open an upload; tried at this value only
 PLAY_FPS, PLAY_STEPS = 15, 600  # poses a second while the path is played, and in all
 SHOWN_MESSAGES = 6  # last messages of a run
+PLAY, PAUSE = "Play the path", "Pause"
 GOING_ON = (State.RUNNING, State.QUEUED)
 NONE = "—"  # of the lists
 IMAGE, RULER, UP = "show image", "measure", "set up"
@@ -50,7 +51,8 @@ class Panel:
         self._shown, self._is_live, self._frame = "", False, -1  # the run that is shown, and its frame
         self._upload: tuple[Path, str] | None = None
         self._mode, self._rows = IMAGE, list[int]()  # of a click; points that were measured
-        self._is_playing = False
+        self._viewer, self._flight = viewer, threading.Event()  # set: the path is not played
+        self._flight.set()
         viewer.gui.configure_theme(control_width="large", show_logo=False, show_share_button=False)
         viewer.gui.main_panel.dock_right()
         self._status = self._gui.add_html("")
@@ -101,8 +103,10 @@ class Panel:
         self._summary = self._gui.add_html("")
         self._timeline = self._gui.add_image(EMPTY, visible=False)
         self._row = self._gui.add_slider("Path", 0, 1, 1, 0, hint="fly along the path")
-        self._row.on_update(self._guarded(lambda _: self._scene.fly(int(self._row.value))))
-        self._button("Play the path", lambda _: self._toggle_play(), color="gray")
+        self._row.on_update(
+            lambda event: event.client and self._scene.fly(int(self._row.value), event.client)
+        )
+        self._play = self._button(PLAY, lambda event: self._toggle_play(event.client), color="gray")
         self._keyframe = self._gui.add_image(EMPTY, visible=False)
         self._other = self._gui.add_dropdown("Compare with", (NONE,))
         self._button("Compare", lambda _: self._compare_run(str(self._other.value)), color="gray")
@@ -146,7 +150,8 @@ class Panel:
     def _open(self, name: str) -> None:
         """Show a run: its map so far, or its result; nothing for an empty name."""
         state = self._runs.state(name) if name else None
-        self._is_playing, self._shown, self._frame, self._rows = False, name, -1, []
+        self._flight.set()
+        self._shown, self._frame, self._rows = name, -1, []
         self._is_live = state in GOING_ON
         for image in (self._keyframe, self._image, self._timeline):
             image.visible = False
@@ -169,18 +174,29 @@ class Panel:
             self._commands.content = f'<pre style="{PRE}">{html.escape(words)}</pre>'
         self._row.max = max(1, len(data["submap"].get("poses", ())) - 1)
 
-    def _toggle_play(self) -> None:
-        def play() -> None:
+    def _toggle_play(self, client: viser.ClientHandle) -> None:
+        """Fly one client along the path until its end, another press of the button, or the client leaves."""
+
+        def play(flight: threading.Event) -> None:
             last = int(self._row.max)
             row = 0 if self._row.value >= last else int(self._row.value)
-            while self._is_playing and row <= last and not self._ended.wait(1 / PLAY_FPS):
+            while (
+                row <= last
+                and client.client_id in self._viewer.get_clients()
+                and not flight.wait(1 / PLAY_FPS)
+            ):
                 self._row.value = row
+                self._scene.fly(row, client)
                 row += max(1, last // PLAY_STEPS)
-            self._is_playing = False
+            flight.set()
+            if flight is self._flight:
+                self._play.label = PLAY
 
-        self._is_playing = not self._is_playing and bool(self._scene.submap)
-        if self._is_playing:
-            threading.Thread(target=play, daemon=True).start()
+        is_start = self._flight.is_set() and bool(self._scene.submap)
+        self._flight.set()
+        if is_start:
+            self._flight, self._play.label = threading.Event(), PAUSE
+            threading.Thread(target=play, args=(self._flight,), daemon=True).start()
 
     def _compare_run(self, name: str) -> None:
         self._compare(self._runs.path(name) / TRAJECTORY, self._runs.record(name).title, is_truth=False)
