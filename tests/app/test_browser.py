@@ -16,7 +16,7 @@ from tests.app.conftest import VIDEO_FRAMES, Server, wait_until
 from torchslam.app.jobs import Runs, State
 
 BROWSER = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
-ARGUMENTS = ["--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
+ARGUMENTS = ["--no-sandbox", "--enable-unsafe-swiftshader"]
 PICTURES = os.environ.get("TORCHSLAM_PICTURES")
 """Folder into which the pictures of README and tutorial are drawn."""
 SLOW_MS = 600_000.0  # a run on a busy machine, milliseconds

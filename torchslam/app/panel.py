@@ -103,9 +103,7 @@ class Panel:
         self._summary = self._gui.add_html("")
         self._timeline = self._gui.add_image(EMPTY, visible=False)
         self._row = self._gui.add_slider("Path", 0, 1, 1, 0, hint="fly along the path")
-        self._row.on_update(
-            lambda event: event.client and self._scene.fly(int(self._row.value), event.client)
-        )
+        self._row.on_update(self._slide)
         self._play = self._button(PLAY, lambda event: self._toggle_play(event.client), color="gray")
         self._keyframe = self._gui.add_image(EMPTY, visible=False)
         self._other = self._gui.add_dropdown("Compare with", (NONE,))
@@ -173,6 +171,10 @@ class Panel:
             words = exports.command_and_python(self._runs.command(name), self._runs.folder)
             self._commands.content = f'<pre style="{PRE}">{html.escape(words)}</pre>'
         self._row.max = max(1, len(data["submap"].get("poses", ())) - 1)
+
+    def _slide(self, event: Any) -> None:
+        if event.client is not None:  # else it is played
+            self._scene.fly(int(self._row.value), event.client)
 
     def _toggle_play(self, client: viser.ClientHandle) -> None:
         """Fly one client along the path until its end, another press of the button, or the client leaves."""

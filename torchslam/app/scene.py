@@ -12,8 +12,8 @@ from viser.transforms import SO3
 
 PATH, UNCERTAIN, TRUTH, OTHER = (87, 150, 65), (190, 130, 225), (60, 60, 60), (230, 140, 40)
 """Red, green, blue."""
-FRUSTUM, MARK = (70, 110, 190), (230, 60, 50)
-"""As `PATH`."""
+MARK = (230, 60, 50)
+"""As `PATH`. Frusta are black: without lights, a mesh has no color."""
 BEADS = 4000
 """Points that a path is drawn by. They touch up to a path of ten times the scene. Without a GPU a point takes 1 µs of a
 frame, a line segment of the viewer 100 µs."""
@@ -31,6 +31,8 @@ class Scene:
 
     def __init__(self, server: viser.ViserServer) -> None:
         self._server, self._scene = server, server.scene
+        self._scene.configure_default_lights(False)  # nothing drawn reflects light, and shadows take time
+        self._scene.configure_environment_map(None)
         self.clear()
 
     def clear(self) -> None:
@@ -156,7 +158,7 @@ class Scene:
         faces = (np.array(SIDES) + 5 * order[:, None, None]).reshape(-1, 3)
         tips = np.concatenate((np.zeros((1, 3)), corners))
         vertices = poses[:, None, :, 3] + np.einsum("kij,cj->kci", poses[:, :, :3], tips)
-        style: dict[str, Any] = {"color": FRUSTUM, "cast_shadow": False, "receive_shadow": False}
+        style: dict[str, Any] = {"cast_shadow": False, "receive_shadow": False}
         if len(poses):
             self._scene.add_mesh_simple("frusta", vertices.reshape(-1, 3), faces, wireframe=True, **style)
 
