@@ -229,11 +229,8 @@ def locked(path: Path) -> Iterator[int]:
         yield file.fileno()
 
 
-def tool(words: Sequence[str], folder: Path, title: str = "", timeout_s: float = TOOL_S) -> str:
-    """Run `torchslam WORDS` at once and return what it prints.
-
-    Raises ResultsError with its message, in which `title` stands for files below the folder.
-    """
+def tool(words: Sequence[str], timeout_s: float = TOOL_S) -> str:
+    """Run `torchslam WORDS` at once and return what it prints. Raises ResultsError with its message."""
     command = [sys.executable, "-m", "torchslam", *words]
     options: dict[str, Any] = {"text": True, "errors": "replace", "timeout": timeout_s}
     try:
@@ -244,9 +241,13 @@ def tool(words: Sequence[str], folder: Path, title: str = "", timeout_s: float =
         return str(done.stdout)
     lines = [line for line in done.stderr.splitlines() if line.strip()] or [f"status {done.returncode}"]
     errors = [line for line in lines if line.startswith("torchslam: error: ")]
-    text = (errors or lines)[-1].removeprefix("torchslam: ").removeprefix("error: ")
+    raise ResultsError(printable((errors or lines)[-1].removeprefix("torchslam: ").removeprefix("error: ")))
+
+
+def without_paths(text: str, folder: Path, title: str = "") -> str:
+    """A message in which a title, or the name alone, stands for each file below a folder."""
     below = re.escape(str(folder)) + r"/[^\s:'\"]*"
-    raise ResultsError(printable(re.sub(below, lambda found: title or Path(found[0]).name, text)))
+    return re.sub(below, lambda found: title or Path(found[0]).name, text)
 
 
 def is_run(path: Path) -> bool:

@@ -14,7 +14,7 @@ import numpy as np
 import viser
 
 from torchslam.app import exports, reading
-from torchslam.app.jobs import DEMO, Runs, State, log_tail, progress_of, tool
+from torchslam.app.jobs import DEMO, Runs, State, log_tail, progress_of, tool, without_paths
 from torchslam.app.options import FILE_KINDS, Options, file_button
 from torchslam.app.scene import Scene, click_of, length_between, length_words
 from torchslam.errors import ResultsError, TorchslamError
@@ -66,7 +66,6 @@ class Panel:
             with tabs.add_tab(label):
                 add()
         viewer.scene.on_click()(self._guarded(self._clicked))
-        self._guarded(lambda _: self._open(runs.running() or next(iter(runs.names()), "")))(None)
         threading.Thread(target=self._watch, daemon=True).start()
 
     def close(self) -> None:
@@ -74,9 +73,15 @@ class Panel:
         self._ended.set()
 
     def received(self, kind: str, path: Path, called: str) -> None:
-        """Take an upload. Raises TorchslamError with the reader's message if it cannot be read."""
+        """Take an upload. Raises ResultsError with the reader's message if it cannot be read."""
+        try:
+            self._take(kind, path, called)
+        except TorchslamError as error:
+            raise ResultsError(without_paths(str(error), self._runs.folder, called)) from None
+
+    def _take(self, kind: str, path: Path, called: str) -> None:
         if kind == "recording":
-            lines = tool(["info", str(path)], self._runs.folder, called, CHECK_S).splitlines()
+            lines = tool(["info", str(path)], CHECK_S).splitlines()
             about = dict(line.split(maxsplit=1) for line in lines if len(line.split(maxsplit=1)) == 2)
             self._upload, self._recording.value = (path, called), NONE
             words = f"{called}: {about.get('frames', '?')} frames, {about.get('size', '')}. Start it below."
@@ -166,7 +171,6 @@ class Panel:
         self._summary.content = line_of(data["failure"], "#c92a2a") + table(data["summary"])
         self._timeline.image, self._timeline.visible = data["timeline"], True
         self._links.content = exports.links(f"/runs/{quote(name, safe='')}")
-        self._other.options = (NONE, *(each for each in self._runs.names() if each != name))
         if self._runs.record(name).source:
             words = exports.command_and_python(self._runs.command(name), self._runs.folder)
             self._commands.content = f'<pre style="{PRE}">{html.escape(words)}</pre>'
@@ -243,7 +247,7 @@ class Panel:
         if len(clicks) != 2:
             raise ResultsError("no frame of the run shows both points: click other ones")
         path, meters = str(self._runs.path(self._shown)), f"{self._meters.value:g}"
-        tool(["align", path, "--distance", *clicks, meters], self._runs.folder)
+        tool(["align", path, "--distance", *clicks, meters])
         self._open(self._shown)
 
     def _crop_scene(self) -> None:
@@ -272,6 +276,7 @@ class Panel:
     # --- what goes on
 
     def _watch(self) -> None:
+        self._guarded(lambda _: self._open(self._runs.running() or next(iter(self._runs.names()), "")))(None)
         look = self._guarded(lambda _: self._follow() if self._is_live else None)
         while not self._ended.wait(TICK_S):
             look(None)
@@ -303,9 +308,12 @@ class Panel:
             words = f"<b>{html.escape(self._runs.record(name).title)}</b><br>{html.escape(name)}<br>"
             words += state.value + (f", {took:.0f} s" if took else "")
             rows.append(f'<div style="{ROW}">{image if state is State.DONE else ""}<div>{words}</div></div>')
-        change(self._list, "content", "".join(rows) or line_of("No runs yet."))
-        change(self._chosen, "options", (NONE, *names))
-        change(self._recording, "options", (NONE, *self._runs.recordings()))
+        self._list.content = "".join(rows) or line_of("No runs yet.")
+        others = [name for name in names if name != self._shown]
+        lists = ((self._chosen, names), (self._other, others), (self._recording, self._runs.recordings()))
+        for each, values in lists:
+            if each.options != (NONE, *values):
+                each.options = (NONE, *values)
         self._shown = self._shown if self._shown in names else ""
         self._refresh_status()
 
@@ -314,6 +322,8 @@ class Panel:
         state = self._runs.state(self._shown) if self._shown else None
         log = log_tail(self._runs.path(self._shown)) if self._shown else []
         words, share = progress_of(log) if state is State.RUNNING else ("", 0.0)
+        if state is State.QUEUED and (first := self._runs.running()):
+            words = f"waits for {self._runs.record(first).title}"
         messages = [line.removeprefix("torchslam: ") for line in log if line.startswith("torchslam: ")]
         if state is State.FAILED and not (log and log[-1].startswith("torchslam: error: ")):
             messages.append(f"the run ended unexpectedly: {log[-1] if log else 'no message'}")
@@ -322,11 +332,10 @@ class Panel:
         if state is not None:
             content = f"<b>{html.escape(self._runs.record(self._shown).title)}</b>: {state.value}"
         content += "".join(f"<br>{html.escape(each)}" for each in lines if each)
-        change(self._status, "content", f'<div style="{LINE}">{content}</div>')
-        change(self._bar, "value", 100.0 * share)
-        for each in (self._bar, self._stop):
-            change(each, "visible", state in GOING_ON)
-        change(self._resume, "visible", state in (State.STOPPED, State.FAILED))
+        self._status.content = f'<div style="{LINE}">{content}</div>'
+        self._bar.value = 100.0 * share
+        self._bar.visible = self._stop.visible = state in GOING_ON
+        self._resume.visible = state in (State.STOPPED, State.FAILED)
         if state in GOING_ON and not self._is_live:  # it was resumed
             self._open(self._shown)
 
@@ -346,10 +355,11 @@ class Panel:
             except Exception as error:  # the page goes on, whatever it is
                 if not isinstance(error, TorchslamError | OSError):
                     traceback.print_exc()
+                words = printable(without_paths(str(error), self._runs.folder))
                 if event is not None and event.client is not None:
-                    event.client.add_notification("That did not work", printable(str(error)), color="red")
+                    event.client.add_notification("That did not work", words, color="red")
                 else:
-                    self._status.content = line_of(str(error), "#c92a2a")
+                    self._status.content = line_of(words, "#c92a2a")
 
         return guarded
 
@@ -367,9 +377,3 @@ def table(rows: Mapping[str, str]) -> str:
         for key, value in rows.items()
     )
     return f'<table style="margin:4px 12px;font-size:0.8em">{cells}</table>'
-
-
-def change(handle: Any, name: str, value: Any) -> None:
-    """Change a property where it differs, so that nothing is sent otherwise."""
-    if getattr(handle, name) != value:
-        setattr(handle, name, value)

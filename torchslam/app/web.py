@@ -26,7 +26,7 @@ from websockets.exceptions import WebSocketException
 from websockets.typing import Subprotocol
 
 from torchslam.app.exports import check_disk, write_export
-from torchslam.app.jobs import INPUT, Runs, shown, stored_name
+from torchslam.app.jobs import INPUT, Runs, shown, stored_name, without_paths
 from torchslam.errors import ResultsError, TorchslamError
 from torchslam.utils.files import parse_json
 
@@ -231,7 +231,7 @@ def application(
 
     async def refused(request: Request, error: Exception) -> Response:
         words = error.strerror if isinstance(error, OSError) else str(error)
-        return _error(words or "the connection was lost")
+        return _error(without_paths(words or "the connection was lost", runs.folder))
 
     routes: list[Any] = [
         Route("/", lambda _: Response(home, media_type="text/html")),
