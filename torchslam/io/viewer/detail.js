@@ -1,8 +1,8 @@
 /* Levels of detail, of view.html and of `torchslam app`.
  *
  * Large clouds, and frusta as a mesh of lines, come in random order. While the view moves, only a first part of them is
- * drawn, as much as the renderer draws at 25 frames a second, on a slow one with half of the resolution; at rest 15
- * times as much with all of it, which takes below a second. A GPU draws all points at any time.
+ * drawn, as much as the renderer draws at 25 frames a second, on a slow one with half of the resolution and without
+ * images; at rest 15 times as much with all of it, which takes below a second. A GPU draws everything at any time.
  */
 const detail = { scale: 1, changed() {} }; // resolution relative to that of the screen; called when to draw again
 (() => {
@@ -11,6 +11,7 @@ const detail = { scale: 1, changed() {} }; // resolution relative to that of the
   // Points that are drawn at least, while the view moves and at rest; with a limit below SLOW, the resolution is halved.
   const [LEAST, LEAST_AT_REST, SLOW] = [2000, 150000, 30000];
   const FRUSTUM = { vertices: 24, points: 50 }; // of its lines; points that take as long
+  const IMAGE = 6; // vertices of its triangles; images are not drawn at half of the resolution
   let [limit, largest, isResting, isCut, drawn, idle, before, touched] = [40000, 0, false, false, 0, 0, -1, -Infinity];
   const isStill = (now) => drawn < BURST && now - touched > STILL_MS;
 
@@ -26,6 +27,7 @@ const detail = { scale: 1, changed() {} }; // resolution relative to that of the
     const isPoints = mode === gl.POINTS;
     const points = isPoints ? count : mode === gl.LINES ? (count / FRUSTUM.vertices) * FRUSTUM.points : 1;
     largest = Math.max(largest, points);
+    if (mode === gl.TRIANGLES && count === IMAGE && detail.scale < 1) return 0;
     const most = isResting ? Math.max(LEAST_AT_REST, limit * AT_REST) : limit;
     if (points <= most) return count;
     isCut = !isResting;
@@ -60,7 +62,7 @@ const detail = { scale: 1, changed() {} }; // resolution relative to that of the
     const draw = gl[name];
     gl[name] = function (...words) {
       words[at] = allowed(words[0], words[at]);
-      draw.apply(this, words);
+      if (words[at]) draw.apply(this, words);
     };
   }
   // Smooth edges take four times as long where there is no GPU.
