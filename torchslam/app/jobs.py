@@ -76,10 +76,8 @@ class Runs:
 
     def names(self) -> list[str]:
         """The names of all runs, the latest first, also of those that were started elsewhere."""
-        found = [each for each in self.folder.iterdir() if is_run(each)]
-        return [
-            each.name for each in sorted(found, key=lambda path: time_of(path / RECORD, path), reverse=True)
-        ]
+        found = [(time_of(each / RECORD, each), each.name) for each in self.folder.iterdir() if is_run(each)]
+        return [name for _, name in sorted(found, reverse=True)]
 
     def path(self, name: str) -> Path:
         """The folder of a run. Raises ResultsError for a name that is none of a run."""
@@ -137,9 +135,7 @@ class Runs:
             arguments, names = tuple(arguments), self.names()
             check_arguments(arguments)
             if len(names) >= self._max_runs:
-                raise ResultsError(
-                    f"{len(names)} runs in the folder: delete some, or use a larger --max-runs"
-                )
+                raise ResultsError(f"{len(names)} runs in the folder: delete some, or raise --max-runs")
             if len(list(self.folder.glob(f"*/{QUEUE}"))) >= MAX_QUEUED:
                 raise ResultsError(f"{MAX_QUEUED} runs wait already")
             stem = f"{time.strftime('%Y%m%d-%H%M%S')}-{slug(Path(title).stem)}"

@@ -14,7 +14,7 @@ import numpy as np
 import viser
 
 from torchslam.app import exports, reading
-from torchslam.app.jobs import DEMO, Runs, State, log_tail, progress_of, tool, without_paths
+from torchslam.app.jobs import DEMO, INTERRUPTED, Runs, State, log_tail, progress_of, tool, without_paths
 from torchslam.app.options import FILE_KINDS, Options, file_button
 from torchslam.app.scene import Scene, click_of, length_between, length_words
 from torchslam.errors import ResultsError, TorchslamError
@@ -50,7 +50,7 @@ class Panel:
         self._scene, self._lock, self._ended = Scene(viewer), threading.RLock(), threading.Event()
         self._shown, self._is_live, self._frame = "", False, -1  # the run that is shown, and its frame
         self._upload: tuple[Path, str] | None = None
-        self._mode, self._rows = IMAGE, list[int]()  # of a click; points that were measured
+        self._rows = list[int]()  # points that were measured
         self._viewer, self._flight = viewer, threading.Event()  # set: the path is not played
         self._flight.set()
         viewer.gui.configure_theme(control_width="large", show_logo=False, show_share_button=False)
@@ -117,8 +117,8 @@ class Panel:
         self._comparison = self._gui.add_html("")
 
     def _add_measures(self) -> None:
-        group = self._gui.add_button_group("A click will", (IMAGE, RULER, UP))
-        group.on_click(self._guarded(lambda event: self._set_mode(str(event.target.value))))
+        self._mode = self._gui.add_dropdown("A click will", (IMAGE, RULER, UP))
+        self._mode.on_update(self._guarded(lambda _: self._show_mode()))
         self._length = self._gui.add_html(line_of(WORDS[IMAGE]))
         self._meters = self._gui.add_number("True length, m", 1.0, min=1e-3, max=1e5, step=1e-3)
         self._button("Set the length", lambda _: self._set_length())
@@ -155,7 +155,7 @@ class Panel:
         state = self._runs.state(name) if name else None
         self._flight.set()
         self._shown, self._frame, self._rows = name, -1, []
-        self._is_live = state in GOING_ON
+        self._is_live, self._mode.value = state in GOING_ON, IMAGE
         for image in (self._keyframe, self._image, self._timeline):
             image.visible = False
         for text in (self._summary, self._comparison, self._commands):
@@ -215,20 +215,21 @@ class Panel:
         self._scene.show_other(positions)
         self._comparison.content = line_of(f"{title} (orange): {words}")
 
-    def _set_mode(self, mode: str) -> None:
-        self._mode, self._rows = mode, []
-        self._length.content = line_of(WORDS[mode])
+    def _show_mode(self) -> None:
+        self._rows, self._length.content = [], line_of(WORDS[self._mode.value])
 
     def _clicked(self, event: Any) -> None:
         if not self._scene.submap:
             return
-        row, words = self._scene.clicked(event, is_keyframe=self._mode == IMAGE), WORDS[self._mode]
+        mode = self._mode.value
+        row, words = self._scene.clicked(event, is_keyframe=mode == IMAGE), WORDS[mode]
         if row < 0:
             words = "There is nothing within 14 pixels."
-        elif self._mode == IMAGE:
+        elif mode == IMAGE:
             found = self._reader.call(reading.residuals, self._runs.path(self._shown), row)
             (self._keyframe.image, self._keyframe.label), self._keyframe.visible = found, True
-        elif self._mode == UP:
+            words = "The image is shown in Result."
+        elif mode == UP:
             self._scene.turn_up(row, np.asarray(event.ray_origin))
         else:
             self._rows = [*self._rows, row] if len(self._rows) == 1 and self._rows != [row] else [row]
@@ -325,8 +326,9 @@ class Panel:
         if state is State.QUEUED and (first := self._runs.running()):
             words = f"waits for {self._runs.record(first).title}"
         messages = [line.removeprefix("torchslam: ") for line in log if line.startswith("torchslam: ")]
-        if state is State.FAILED and not (log and log[-1].startswith("torchslam: error: ")):
-            messages.append(f"the run ended unexpectedly: {log[-1] if log else 'no message'}")
+        has_ended = state in (State.STOPPED, State.FAILED)
+        if has_ended and log and not log[-1].startswith(("torchslam: error: ", INTERRUPTED)):
+            messages.append(f"the run ended unexpectedly: {log[-1]}")
         lines = [words, *(messages[-SHOWN_MESSAGES:] if state is not State.DONE else [])]
         content = "torchslam: from a video to a map"
         if state is not None:
@@ -335,7 +337,7 @@ class Panel:
         self._status.content = f'<div style="{LINE}">{content}</div>'
         self._bar.value = 100.0 * share
         self._bar.visible = self._stop.visible = state in GOING_ON
-        self._resume.visible = state in (State.STOPPED, State.FAILED)
+        self._resume.visible = has_ended
         if state in GOING_ON and not self._is_live:  # it was resumed
             self._open(self._shown)
 

@@ -37,10 +37,8 @@ UPLOADS = ".uploads"  # folder of what is being uploaded, and of what waits for 
 # Of users, and of the connection from here to the viewer.
 COOKIE, SECRET = "torchslam-token", "x-torchslam-secret"
 LOCAL = ("localhost", "127.0.0.1", "[::1]")  # names of this computer
-MAX_FILES, MAX_LIST = (
-    10_000,
-    1 << 22,
-)  # photos of a walk that are uploaded together; bytes of the list of their names
+MAX_FILES = 10_000  # photos of a walk that are uploaded together
+MAX_LIST = 1 << 22  # bytes of the list of their names
 MAX_TABS, MAX_OPEN = 100, 20  # connections to the viewer, and uploads, at the same time
 PROTECTION = {
     "x-content-type-options": "nosniff",
