@@ -237,7 +237,7 @@ def test_a_run_that_is_stopped_is_resumed_and_a_second_tab_shows_it(
     page.get_by_text(re.compile(r"[1-9]\d{2,} points")).wait_for(timeout=SLOW_MS)
     if PICTURES:
         page.get_by_text(re.compile(r"1\d{3} points")).wait_for(timeout=SLOW_MS)
-        page.wait_for_timeout(8000)  # for the map to be drawn
+        page.wait_for_timeout(2000)  # for the map to be drawn
     draw(page, "app-running")
     other = browser.new_page(viewport={"width": 700, "height": 400})
     other.goto(server.address)
