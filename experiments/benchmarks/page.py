@@ -29,9 +29,9 @@ KEYFRAMES, DENSE, FRAMES, THUMBNAILS = (
     2000,
     500_000,
     18_000,
-    48,
+    24,
 )  # as of 2 million points, of which as many are sent
-ARGUMENTS = ["--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
+ARGUMENTS = ["--no-sandbox", "--enable-unsafe-swiftshader"]
 SECONDS = 20.0  # of dragging, after those in which the number of points settles
 # Counts the points of the largest cloud in each frame that is drawn; installed before the page's own script.
 COUNT = """(() => {

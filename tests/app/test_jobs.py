@@ -198,9 +198,11 @@ def test_progress_and_messages_are_read_from_the_log(tmp_path: Path) -> None:
 def test_the_message_of_a_reader_names_the_file_as_the_user_does(tmp_path: Path) -> None:
     path = tmp_path / "input.txt"
     path.write_text("x")
-    with pytest.raises(ResultsError, match=r"^holiday\.txt: .*neither a video") as refused:
-        jobs.tool(["info", str(path)], tmp_path, "holiday.txt")
-    assert str(tmp_path) not in str(refused.value)
+    with pytest.raises(ResultsError, match="neither a video") as refused:
+        jobs.tool(["info", str(path)])
+    message = str(refused.value)
+    assert jobs.without_paths(message, tmp_path, "holiday.txt").startswith("holiday.txt: ")
+    assert jobs.without_paths(message, tmp_path).startswith("input.txt: ")
 
 
 def test_a_zip_of_all_results_has_neither_the_upload_nor_links(tmp_path: Path) -> None:

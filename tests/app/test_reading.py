@@ -115,6 +115,19 @@ class TestMeasures:
         assert self.code.nearest_to_ray(points, eye, np.array([0.0, 1, 0]), 1e-3) == -1
         assert self.code.nearest_to_ray(points[:0], eye, ahead, 1e-3) == -1
 
+    def test_a_click_into_a_frustum_takes_the_nearest_image(self) -> None:
+        corners = np.array([[-1.0, -1, 2], [1, -1, 2], [1, 1, 2], [-1, 1, 2]])
+        poses = np.stack([np.eye(3, 4)] * 3)
+        poses[0, 2, 3], poses[2, :, :3] = (
+            5.0,
+            [[0, 0, 1], [0, 1, 0], [-1, 0, 0]],
+        )  # behind the second, and turned
+        eye = np.array([0.9, 0.9, -1.0])
+        assert self.code.frustum_on_ray(poses, corners, eye, np.array([0.0, 0, 1])) == 1
+        assert self.code.frustum_on_ray(poses, corners, eye, np.array([0.0, 0, -1])) == -1
+        assert self.code.frustum_on_ray(poses, corners, np.array([5.0, 0.5, 0]), np.array([-1.0, 0, 0])) == 2
+        assert self.code.frustum_on_ray(poses[:0], corners, eye, np.array([0.0, 0, 1])) == -1
+
     def test_the_plane_of_a_floor_faces_the_eye(self) -> None:
         rng = np.random.default_rng(0)
         floor = np.c_[rng.uniform(-1, 1, (200, 2)), rng.normal(0, 1e-3, 200)]

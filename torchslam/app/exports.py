@@ -58,7 +58,7 @@ def write_export(path: Path, kind: str) -> Path:
         with tempfile.TemporaryDirectory(dir=path, prefix=TAKEN) as written:
             target = str(file) if name else written
             if words:
-                tool(["export", str(path), *words, "--output", target, "--overwrite"], path.parent)
+                tool(["export", str(path), *words, "--output", target, "--overwrite"])
             if not name:
                 zip_folder(Path(written) if words else path, file)
     return file

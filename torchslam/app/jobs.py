@@ -76,10 +76,8 @@ class Runs:
 
     def names(self) -> list[str]:
         """The names of all runs, the latest first, also of those that were started elsewhere."""
-        found = [each for each in self.folder.iterdir() if is_run(each)]
-        return [
-            each.name for each in sorted(found, key=lambda path: time_of(path / RECORD, path), reverse=True)
-        ]
+        found = [(time_of(each / RECORD, each), each.name) for each in self.folder.iterdir() if is_run(each)]
+        return [name for _, name in sorted(found, reverse=True)]
 
     def path(self, name: str) -> Path:
         """The folder of a run. Raises ResultsError for a name that is none of a run."""
@@ -137,9 +135,7 @@ class Runs:
             arguments, names = tuple(arguments), self.names()
             check_arguments(arguments)
             if len(names) >= self._max_runs:
-                raise ResultsError(
-                    f"{len(names)} runs in the folder: delete some, or use a larger --max-runs"
-                )
+                raise ResultsError(f"{len(names)} runs in the folder: delete some, or raise --max-runs")
             if len(list(self.folder.glob(f"*/{QUEUE}"))) >= MAX_QUEUED:
                 raise ResultsError(f"{MAX_QUEUED} runs wait already")
             stem = f"{time.strftime('%Y%m%d-%H%M%S')}-{slug(Path(title).stem)}"
@@ -229,11 +225,8 @@ def locked(path: Path) -> Iterator[int]:
         yield file.fileno()
 
 
-def tool(words: Sequence[str], folder: Path, title: str = "", timeout_s: float = TOOL_S) -> str:
-    """Run `torchslam WORDS` at once and return what it prints.
-
-    Raises ResultsError with its message, in which `title` stands for files below the folder.
-    """
+def tool(words: Sequence[str], timeout_s: float = TOOL_S) -> str:
+    """Run `torchslam WORDS` at once and return what it prints. Raises ResultsError with its message."""
     command = [sys.executable, "-m", "torchslam", *words]
     options: dict[str, Any] = {"text": True, "errors": "replace", "timeout": timeout_s}
     try:
@@ -244,9 +237,13 @@ def tool(words: Sequence[str], folder: Path, title: str = "", timeout_s: float =
         return str(done.stdout)
     lines = [line for line in done.stderr.splitlines() if line.strip()] or [f"status {done.returncode}"]
     errors = [line for line in lines if line.startswith("torchslam: error: ")]
-    text = (errors or lines)[-1].removeprefix("torchslam: ").removeprefix("error: ")
+    raise ResultsError(printable((errors or lines)[-1].removeprefix("torchslam: ").removeprefix("error: ")))
+
+
+def without_paths(text: str, folder: Path, title: str = "") -> str:
+    """A message in which a title, or the name alone, stands for each file below a folder."""
     below = re.escape(str(folder)) + r"/[^\s:'\"]*"
-    raise ResultsError(printable(re.sub(below, lambda found: title or Path(found[0]).name, text)))
+    return re.sub(below, lambda found: title or Path(found[0]).name, text)
 
 
 def is_run(path: Path) -> bool:

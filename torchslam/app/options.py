@@ -89,9 +89,9 @@ class Options:
             "--stride": f"{self._stride.value:.0f}",
             "--camera": self._files["camera"].name
             if camera == FILE
-            else None
-            if camera == UNKNOWN
-            else camera,
+            else camera
+            if camera != UNKNOWN
+            else None,
             "--marker": self._marker.value if meters == MARKER else None,
             "--camera-height": f"{self._height.value:g}" if meters == HEIGHT else None,
             "--gps": self._files["gps"].name if meters == GPS else None,

@@ -9,6 +9,20 @@
   document.addEventListener("DOMContentLoaded", () => document.body.append(bar));
   document.title = "torchslam";
 
+  // The viewer has no options for its resolution, and for its empty background, which takes half of a frame on a CPU.
+  const beginning = setInterval(() => {
+    const { backgroundMaterial, scene } = window.__viserMutable ?? {};
+    const store = scene?.__r3f?.root;
+    if (!store || !backgroundMaterial) return;
+    clearInterval(beginning);
+    backgroundMaterial.visible = false;
+    detail.changed = ({ viewport, setDpr } = store.getState()) => {
+      const dpr = detail.scale * Math.min(devicePixelRatio, 2);
+      if (viewport.dpr !== dpr) setDpr(dpr);
+    };
+    store.subscribe(detail.changed); // the viewer also lowers it by itself
+  }, 100);
+
   function say(words, isError) {
     bar.textContent = isError ? `${words}\n(click to close)` : words;
     bar.style.background = isError ? "#991b1b" : "#1f2937";

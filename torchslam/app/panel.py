@@ -14,7 +14,7 @@ import numpy as np
 import viser
 
 from torchslam.app import exports, reading
-from torchslam.app.jobs import DEMO, Runs, State, log_tail, progress_of, tool
+from torchslam.app.jobs import DEMO, INTERRUPTED, Runs, State, log_tail, progress_of, tool, without_paths
 from torchslam.app.options import FILE_KINDS, Options, file_button
 from torchslam.app.scene import Scene, click_of, length_between, length_words
 from torchslam.errors import ResultsError, TorchslamError
@@ -26,6 +26,7 @@ TICK_S = 1.0
 CHECK_S = 120.0  # seconds in which a reader is to open an upload; tried at this value only
 PLAY_FPS, PLAY_STEPS = 15, 600  # poses a second while the path is played, and in all
 SHOWN_MESSAGES = 6  # last messages of a run
+PLAY, PAUSE = "Play the path", "Pause"
 GOING_ON = (State.RUNNING, State.QUEUED)
 NONE = "—"  # of the lists
 IMAGE, RULER, UP = "show image", "measure", "set up"
@@ -49,8 +50,9 @@ class Panel:
         self._scene, self._lock, self._ended = Scene(viewer), threading.RLock(), threading.Event()
         self._shown, self._is_live, self._frame = "", False, -1  # the run that is shown, and its frame
         self._upload: tuple[Path, str] | None = None
-        self._mode, self._rows = IMAGE, list[int]()  # of a click; points that were measured
-        self._is_playing = False
+        self._rows = list[int]()  # points that were measured
+        self._viewer, self._flight = viewer, threading.Event()  # set: the path is not played
+        self._flight.set()
         viewer.gui.configure_theme(control_width="large", show_logo=False, show_share_button=False)
         viewer.gui.main_panel.dock_right()
         self._status = self._gui.add_html("")
@@ -64,7 +66,6 @@ class Panel:
             with tabs.add_tab(label):
                 add()
         viewer.scene.on_click()(self._guarded(self._clicked))
-        self._guarded(lambda _: self._open(runs.running() or next(iter(runs.names()), "")))(None)
         threading.Thread(target=self._watch, daemon=True).start()
 
     def close(self) -> None:
@@ -72,9 +73,15 @@ class Panel:
         self._ended.set()
 
     def received(self, kind: str, path: Path, called: str) -> None:
-        """Take an upload. Raises TorchslamError with the reader's message if it cannot be read."""
+        """Take an upload. Raises ResultsError with the reader's message if it cannot be read."""
+        try:
+            self._take(kind, path, called)
+        except TorchslamError as error:
+            raise ResultsError(without_paths(str(error), self._runs.folder, called)) from None
+
+    def _take(self, kind: str, path: Path, called: str) -> None:
         if kind == "recording":
-            lines = tool(["info", str(path)], self._runs.folder, called, CHECK_S).splitlines()
+            lines = tool(["info", str(path)], CHECK_S).splitlines()
             about = dict(line.split(maxsplit=1) for line in lines if len(line.split(maxsplit=1)) == 2)
             self._upload, self._recording.value = (path, called), NONE
             words = f"{called}: {about.get('frames', '?')} frames, {about.get('size', '')}. Start it below."
@@ -101,8 +108,8 @@ class Panel:
         self._summary = self._gui.add_html("")
         self._timeline = self._gui.add_image(EMPTY, visible=False)
         self._row = self._gui.add_slider("Path", 0, 1, 1, 0, hint="fly along the path")
-        self._row.on_update(self._guarded(lambda _: self._scene.fly(int(self._row.value))))
-        self._button("Play the path", lambda _: self._toggle_play(), color="gray")
+        self._row.on_update(self._slide)
+        self._play = self._button(PLAY, lambda event: self._toggle_play(event.client), color="gray")
         self._keyframe = self._gui.add_image(EMPTY, visible=False)
         self._other = self._gui.add_dropdown("Compare with", (NONE,))
         self._button("Compare", lambda _: self._compare_run(str(self._other.value)), color="gray")
@@ -110,8 +117,8 @@ class Panel:
         self._comparison = self._gui.add_html("")
 
     def _add_measures(self) -> None:
-        group = self._gui.add_button_group("A click will", (IMAGE, RULER, UP))
-        group.on_click(self._guarded(lambda event: self._set_mode(str(event.target.value))))
+        self._mode = self._gui.add_dropdown("A click will", (IMAGE, RULER, UP))
+        self._mode.on_update(self._guarded(lambda _: self._show_mode()))
         self._length = self._gui.add_html(line_of(WORDS[IMAGE]))
         self._meters = self._gui.add_number("True length, m", 1.0, min=1e-3, max=1e5, step=1e-3)
         self._button("Set the length", lambda _: self._set_length())
@@ -146,8 +153,9 @@ class Panel:
     def _open(self, name: str) -> None:
         """Show a run: its map so far, or its result; nothing for an empty name."""
         state = self._runs.state(name) if name else None
-        self._is_playing, self._shown, self._frame, self._rows = False, name, -1, []
-        self._is_live = state in GOING_ON
+        self._flight.set()
+        self._shown, self._frame, self._rows = name, -1, []
+        self._is_live, self._mode.value = state in GOING_ON, IMAGE
         for image in (self._keyframe, self._image, self._timeline):
             image.visible = False
         for text in (self._summary, self._comparison, self._commands):
@@ -163,24 +171,38 @@ class Panel:
         self._summary.content = line_of(data["failure"], "#c92a2a") + table(data["summary"])
         self._timeline.image, self._timeline.visible = data["timeline"], True
         self._links.content = exports.links(f"/runs/{quote(name, safe='')}")
-        self._other.options = (NONE, *(each for each in self._runs.names() if each != name))
         if self._runs.record(name).source:
             words = exports.command_and_python(self._runs.command(name), self._runs.folder)
             self._commands.content = f'<pre style="{PRE}">{html.escape(words)}</pre>'
         self._row.max = max(1, len(data["submap"].get("poses", ())) - 1)
 
-    def _toggle_play(self) -> None:
-        def play() -> None:
+    def _slide(self, event: Any) -> None:
+        if event.client is not None:  # else it is played
+            self._scene.fly(int(self._row.value), event.client)
+
+    def _toggle_play(self, client: viser.ClientHandle) -> None:
+        """Fly one client along the path until its end, another press of the button, or the client leaves."""
+
+        def play(flight: threading.Event) -> None:
             last = int(self._row.max)
             row = 0 if self._row.value >= last else int(self._row.value)
-            while self._is_playing and row <= last and not self._ended.wait(1 / PLAY_FPS):
+            while (
+                row <= last
+                and client.client_id in self._viewer.get_clients()
+                and not flight.wait(1 / PLAY_FPS)
+            ):
                 self._row.value = row
+                self._scene.fly(row, client)
                 row += max(1, last // PLAY_STEPS)
-            self._is_playing = False
+            flight.set()
+            if flight is self._flight:
+                self._play.label = PLAY
 
-        self._is_playing = not self._is_playing and bool(self._scene.submap)
-        if self._is_playing:
-            threading.Thread(target=play, daemon=True).start()
+        is_start = self._flight.is_set() and bool(self._scene.submap)
+        self._flight.set()
+        if is_start:
+            self._flight, self._play.label = threading.Event(), PAUSE
+            threading.Thread(target=play, args=(self._flight,), daemon=True).start()
 
     def _compare_run(self, name: str) -> None:
         self._compare(self._runs.path(name) / TRAJECTORY, self._runs.record(name).title, is_truth=False)
@@ -193,20 +215,21 @@ class Panel:
         self._scene.show_other(positions)
         self._comparison.content = line_of(f"{title} (orange): {words}")
 
-    def _set_mode(self, mode: str) -> None:
-        self._mode, self._rows = mode, []
-        self._length.content = line_of(WORDS[mode])
+    def _show_mode(self) -> None:
+        self._rows, self._length.content = [], line_of(WORDS[self._mode.value])
 
     def _clicked(self, event: Any) -> None:
         if not self._scene.submap:
             return
-        row, words = self._scene.clicked(event, is_keyframe=self._mode == IMAGE), WORDS[self._mode]
+        mode = self._mode.value
+        row, words = self._scene.clicked(event, is_keyframe=mode == IMAGE), WORDS[mode]
         if row < 0:
             words = "There is nothing within 14 pixels."
-        elif self._mode == IMAGE:
+        elif mode == IMAGE:
             found = self._reader.call(reading.residuals, self._runs.path(self._shown), row)
             (self._keyframe.image, self._keyframe.label), self._keyframe.visible = found, True
-        elif self._mode == UP:
+            words = "The image is shown in Result."
+        elif mode == UP:
             self._scene.turn_up(row, np.asarray(event.ray_origin))
         else:
             self._rows = [*self._rows, row] if len(self._rows) == 1 and self._rows != [row] else [row]
@@ -225,7 +248,7 @@ class Panel:
         if len(clicks) != 2:
             raise ResultsError("no frame of the run shows both points: click other ones")
         path, meters = str(self._runs.path(self._shown)), f"{self._meters.value:g}"
-        tool(["align", path, "--distance", *clicks, meters], self._runs.folder)
+        tool(["align", path, "--distance", *clicks, meters])
         self._open(self._shown)
 
     def _crop_scene(self) -> None:
@@ -254,6 +277,7 @@ class Panel:
     # --- what goes on
 
     def _watch(self) -> None:
+        self._guarded(lambda _: self._open(self._runs.running() or next(iter(self._runs.names()), "")))(None)
         look = self._guarded(lambda _: self._follow() if self._is_live else None)
         while not self._ended.wait(TICK_S):
             look(None)
@@ -285,9 +309,12 @@ class Panel:
             words = f"<b>{html.escape(self._runs.record(name).title)}</b><br>{html.escape(name)}<br>"
             words += state.value + (f", {took:.0f} s" if took else "")
             rows.append(f'<div style="{ROW}">{image if state is State.DONE else ""}<div>{words}</div></div>')
-        change(self._list, "content", "".join(rows) or line_of("No runs yet."))
-        change(self._chosen, "options", (NONE, *names))
-        change(self._recording, "options", (NONE, *self._runs.recordings()))
+        self._list.content = "".join(rows) or line_of("No runs yet.")
+        others = [name for name in names if name != self._shown]
+        lists = ((self._chosen, names), (self._other, others), (self._recording, self._runs.recordings()))
+        for each, values in lists:
+            if each.options != (NONE, *values):
+                each.options = (NONE, *values)
         self._shown = self._shown if self._shown in names else ""
         self._refresh_status()
 
@@ -296,19 +323,21 @@ class Panel:
         state = self._runs.state(self._shown) if self._shown else None
         log = log_tail(self._runs.path(self._shown)) if self._shown else []
         words, share = progress_of(log) if state is State.RUNNING else ("", 0.0)
+        if state is State.QUEUED and (first := self._runs.running()):
+            words = f"waits for {self._runs.record(first).title}"
         messages = [line.removeprefix("torchslam: ") for line in log if line.startswith("torchslam: ")]
-        if state is State.FAILED and not (log and log[-1].startswith("torchslam: error: ")):
-            messages.append(f"the run ended unexpectedly: {log[-1] if log else 'no message'}")
+        has_ended = state in (State.STOPPED, State.FAILED)
+        if has_ended and log and not log[-1].startswith(("torchslam: error: ", INTERRUPTED)):
+            messages.append(f"the run ended unexpectedly: {log[-1]}")
         lines = [words, *(messages[-SHOWN_MESSAGES:] if state is not State.DONE else [])]
         content = "torchslam: from a video to a map"
         if state is not None:
             content = f"<b>{html.escape(self._runs.record(self._shown).title)}</b>: {state.value}"
         content += "".join(f"<br>{html.escape(each)}" for each in lines if each)
-        change(self._status, "content", f'<div style="{LINE}">{content}</div>')
-        change(self._bar, "value", 100.0 * share)
-        for each in (self._bar, self._stop):
-            change(each, "visible", state in GOING_ON)
-        change(self._resume, "visible", state in (State.STOPPED, State.FAILED))
+        self._status.content = f'<div style="{LINE}">{content}</div>'
+        self._bar.value = 100.0 * share
+        self._bar.visible = self._stop.visible = state in GOING_ON
+        self._resume.visible = has_ended
         if state in GOING_ON and not self._is_live:  # it was resumed
             self._open(self._shown)
 
@@ -328,10 +357,11 @@ class Panel:
             except Exception as error:  # the page goes on, whatever it is
                 if not isinstance(error, TorchslamError | OSError):
                     traceback.print_exc()
+                words = printable(without_paths(str(error), self._runs.folder))
                 if event is not None and event.client is not None:
-                    event.client.add_notification("That did not work", printable(str(error)), color="red")
+                    event.client.add_notification("That did not work", words, color="red")
                 else:
-                    self._status.content = line_of(str(error), "#c92a2a")
+                    self._status.content = line_of(words, "#c92a2a")
 
         return guarded
 
@@ -349,9 +379,3 @@ def table(rows: Mapping[str, str]) -> str:
         for key, value in rows.items()
     )
     return f'<table style="margin:4px 12px;font-size:0.8em">{cells}</table>'
-
-
-def change(handle: Any, name: str, value: Any) -> None:
-    """Change a property where it differs, so that nothing is sent otherwise."""
-    if getattr(handle, name) != value:
-        setattr(handle, name, value)

@@ -27,9 +27,9 @@ NICENESS = 5
 """Of the process, relative to the server: a run that is watched comes first. With 10 it starved on a busy machine."""
 PATIENCE_S = 300.0
 """Seconds after which reading is given up. Tried at this value only."""
-LIVE_SIDE, THUMBNAIL_SIDE, MAX_THUMBNAILS = 480, 96, 48
-"""Longer sides of the image during a run and of those in the frusta, pixels; and number of the latter. A frustum with
-its image takes .15 ms of a frame where there is no GPU."""
+LIVE_SIDE, THUMBNAIL_SIDE, MAX_THUMBNAILS = 480, 96, 24
+"""Longer sides of the image during a run and of those in the frusta, pixels; and number of the latter. An image
+takes .2 ms of a frame where there is no GPU."""
 MAX_KEPT = 600  # images that are kept to color the points of a run: up to 0.7 MB each
 MAX_PASSED = 4  # keyframes since the last look whose images are read as well
 UNSEEN = (150, 155, 165)  # red, green, blue of points without an image

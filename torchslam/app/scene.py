@@ -12,8 +12,8 @@ from viser.transforms import SO3
 
 PATH, UNCERTAIN, TRUTH, OTHER = (87, 150, 65), (190, 130, 225), (60, 60, 60), (230, 140, 40)
 """Red, green, blue."""
-FRUSTUM, MARK = (70, 110, 190), (230, 60, 50)
-"""As `PATH`."""
+MARK = (230, 60, 50)
+"""As `PATH`. Frusta are black: without lights, a mesh has no color."""
 BEADS = 4000
 """Points that a path is drawn by. They touch up to a path of ten times the scene. Without a GPU a point takes 1 µs of a
 frame, a line segment of the viewer 100 µs."""
@@ -31,6 +31,8 @@ class Scene:
 
     def __init__(self, server: viser.ViserServer) -> None:
         self._server, self._scene = server, server.scene
+        self._scene.configure_default_lights(False)  # nothing drawn reflects light, and shadows take time
+        self._scene.configure_environment_map(None)
         self.clear()
 
     def clear(self) -> None:
@@ -98,20 +100,23 @@ class Scene:
         up = plane_normal(self.submap["points"], row, eye)
         self._scene.set_up_direction((float(up[0]), float(up[1]), float(up[2])))
 
-    def fly(self, row: int) -> None:
-        """Put the eyes of all who look into a pose of the path."""
+    def fly(self, row: int, client: viser.ClientHandle) -> None:
+        """Move the view of one client to a pose of the path; the views of others stay."""
         for pose in self.submap["poses"][: row + 1][-1:].astype(float) if self.submap else ():
-            for client in self._server.get_clients().values():
-                with client.atomic():
-                    client.camera.wxyz = SO3.from_matrix(pose[:, :3]).wxyz
-                    client.camera.position = pose[:, 3]
+            with client.atomic():
+                client.camera.wxyz = SO3.from_matrix(pose[:, :3]).wxyz
+                client.camera.position = pose[:, 3]
 
     def clicked(self, event: Any, is_keyframe: bool) -> int:
-        """The frame of the keyframe, or the row of the point, that is seen where a click was; -1 without one."""
+        """Return the frame of the keyframe or the row of the point at a click; -1 without one."""
+        ray = np.asarray(event.ray_origin), np.asarray(event.ray_direction)
         pixel = event.client.camera.fov / max(1, event.client.camera.image_height)
-        points = self.submap["keyframe_poses"][:, :, 3] if is_keyframe else self.submap["points"]
-        row = nearest_to_ray(points, np.asarray(event.ray_origin), np.asarray(event.ray_direction), pixel)
-        return int(self.submap["frames"][row]) if is_keyframe and row >= 0 else row
+        if not is_keyframe:
+            return nearest_to_ray(self.submap["points"], *ray, pixel)
+        poses = self.submap["keyframe_poses"]
+        row = frustum_on_ray(poses, self.submap["corners"], *ray)
+        row = nearest_to_ray(poses[:, :, 3], *ray, pixel) if row < 0 else row
+        return int(self.submap["frames"][row]) if row >= 0 else -1
 
     def _aim(self, center: np.ndarray, direction: tuple[float, float, float], distance: float) -> None:
         """Put the eyes of all who look, and of those who come, at a distance of a center."""
@@ -153,7 +158,7 @@ class Scene:
         faces = (np.array(SIDES) + 5 * order[:, None, None]).reshape(-1, 3)
         tips = np.concatenate((np.zeros((1, 3)), corners))
         vertices = poses[:, None, :, 3] + np.einsum("kij,cj->kci", poses[:, :, :3], tips)
-        style: dict[str, Any] = {"color": FRUSTUM, "cast_shadow": False, "receive_shadow": False}
+        style: dict[str, Any] = {"cast_shadow": False, "receive_shadow": False}
         if len(poses):
             self._scene.add_mesh_simple("frusta", vertices.reshape(-1, 3), faces, wireframe=True, **style)
 
@@ -197,6 +202,26 @@ def nearest_to_ray(
     cost = np.where((depth > 0) & (pixels <= REACH_PX), (pixels + BESIDE_PX) * depth, np.inf)
     best = int(cost.argmin())
     return best if np.isfinite(cost[best]) else -1
+
+
+def frustum_on_ray(
+    poses: Float[np.ndarray, "K 3 4"],
+    corners: Float[np.ndarray, "4 3"],
+    eye: Float[np.ndarray, "3"],
+    direction: Float[np.ndarray, "3"],
+) -> int:
+    """Row of the first frustum whose image a ray passes through; -1 without one."""
+    R_cw = poses[:, :, :3].transpose(0, 2, 1)
+    starts, steps = np.einsum("kij,kj->ki", R_cw, eye - poses[:, :, 3]), R_cw @ direction
+    with np.errstate(
+        divide="ignore", invalid="ignore"
+    ):  # a ray along the image plane does not pass through it
+        along = (corners[0, 2] - starts[:, 2]) / steps[:, 2]
+        hits = (starts + along[:, None] * steps)[:, :2]
+        inside = ((hits >= corners[:, :2].min(axis=0)) & (hits <= corners[:, :2].max(axis=0))).all(axis=1)
+    distances = np.where(inside & (along > 0), along, np.inf)
+    best = int(distances.argmin()) if len(poses) else -1
+    return best if best >= 0 and np.isfinite(distances[best]) else -1
 
 
 def length_between(submap: dict[str, Any], rows: list[int]) -> tuple[float, float]:

@@ -26,7 +26,7 @@ from websockets.exceptions import WebSocketException
 from websockets.typing import Subprotocol
 
 from torchslam.app.exports import check_disk, write_export
-from torchslam.app.jobs import INPUT, Runs, shown, stored_name
+from torchslam.app.jobs import INPUT, Runs, shown, stored_name, without_paths
 from torchslam.errors import ResultsError, TorchslamError
 from torchslam.utils.files import parse_json
 
@@ -37,10 +37,8 @@ UPLOADS = ".uploads"  # folder of what is being uploaded, and of what waits for 
 # Of users, and of the connection from here to the viewer.
 COOKIE, SECRET = "torchslam-token", "x-torchslam-secret"
 LOCAL = ("localhost", "127.0.0.1", "[::1]")  # names of this computer
-MAX_FILES, MAX_LIST = (
-    10_000,
-    1 << 22,
-)  # photos of a walk that are uploaded together; bytes of the list of their names
+MAX_FILES = 10_000  # photos of a walk that are uploaded together
+MAX_LIST = 1 << 22  # bytes of the list of their names
 MAX_TABS, MAX_OPEN = 100, 20  # connections to the viewer, and uploads, at the same time
 PROTECTION = {
     "x-content-type-options": "nosniff",
@@ -231,7 +229,7 @@ def application(
 
     async def refused(request: Request, error: Exception) -> Response:
         words = error.strerror if isinstance(error, OSError) else str(error)
-        return _error(words or "the connection was lost")
+        return _error(without_paths(words or "the connection was lost", runs.folder))
 
     routes: list[Any] = [
         Route("/", lambda _: Response(home, media_type="text/html")),

@@ -1,13 +1,17 @@
 /* Levels of detail, of view.html and of `torchslam app`.
  *
  * Large clouds, and frusta as a mesh of lines, come in random order. While the view moves, only a first part of them is
- * drawn, as much as the renderer draws at 20 frames a second; at rest 15 times as much, which takes below a second.
+ * drawn, as much as the renderer draws at 25 frames a second, on a slow one with half of the resolution and without
+ * images; at rest 15 times as much with all of it, which takes below a second. A GPU draws everything at any time.
  */
-const detail = { rested() {} }; // called when the view rests and its last frame was not drawn in full
+const detail = { scale: 1, changed() {} }; // resolution relative to that of the screen; called when to draw again
 (() => {
   const gl = WebGL2RenderingContext.prototype;
-  const [FRAME_MS, AT_REST, IDLE, BURST, STILL_MS, LEAST] = [45, 15, 10, 5, 500, 20000]; // the last in points
-  const FRUSTUM = { vertices: 24, points: 200 }; // of its lines; points that take as long
+  const [FRAME_MS, AT_REST, IDLE, BURST, STILL_MS] = [40, 15, 10, 5, 500];
+  // Points that are drawn at least, while the view moves and at rest; with a limit below SLOW, the resolution is halved.
+  const [LEAST, LEAST_AT_REST, SLOW] = [2000, 150000, 30000];
+  const FRUSTUM = { vertices: 24, points: 50 }; // of its lines; points that take as long
+  const IMAGE = 6; // vertices of its triangles; images are not drawn at half of the resolution
   let [limit, largest, isResting, isCut, drawn, idle, before, touched] = [40000, 0, false, false, 0, 0, -1, -Infinity];
   const isStill = (now) => drawn < BURST && now - touched > STILL_MS;
 
@@ -23,7 +27,8 @@ const detail = { rested() {} }; // called when the view rests and its last frame
     const isPoints = mode === gl.POINTS;
     const points = isPoints ? count : mode === gl.LINES ? (count / FRUSTUM.vertices) * FRUSTUM.points : 1;
     largest = Math.max(largest, points);
-    const most = Math.max(LEAST, limit * (isResting ? AT_REST : 1));
+    if (mode === gl.TRIANGLES && count === IMAGE && detail.scale < 1) return 0;
+    const most = isResting ? Math.max(LEAST_AT_REST, limit * AT_REST) : limit;
     if (points <= most) return count;
     isCut = !isResting;
     return isPoints ? Math.floor(most) : FRUSTUM.vertices * Math.ceil(most / FRUSTUM.points);
@@ -35,21 +40,29 @@ const detail = { rested() {} }; // called when the view rests and its last frame
       // The frames before wait for what was drawn in the pause.
       const factor = Math.max(0.5, Math.min(1.15, Math.sqrt(FRAME_MS / (now - before))));
       if (factor < 1 || largest > limit) limit = Math.max(LEAST, Math.min(limit, largest) * factor);
+      if (limit < SLOW) rescale(0.5);
     }
     idle = largest ? 0 : idle + 1;
     drawn = largest ? drawn + 1 : idle < IDLE ? drawn : 0;
     [largest, before, isResting] = [0, now, isStill(now)];
     if (idle < IDLE || now - touched <= STILL_MS) return requestAnimationFrame(look);
     before = -1;
-    if (isCut) detail.rested();
+    if (isCut) detail.changed();
     isCut = false;
+    rescale(1);
+  }
+
+  function rescale(scale) {
+    if (detail.scale === scale) return;
+    detail.scale = scale;
+    detail.changed();
   }
 
   for (const [name, at] of [["drawArrays", 2], ["drawElements", 1]]) {
     const draw = gl[name];
     gl[name] = function (...words) {
       words[at] = allowed(words[0], words[at]);
-      draw.apply(this, words);
+      if (words[at]) draw.apply(this, words);
     };
   }
   // Smooth edges take four times as long where there is no GPU.

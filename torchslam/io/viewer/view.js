@@ -114,7 +114,7 @@ function redraw() {
 
 function draw() {
   const canvas = $("scene");
-  const scale = Math.min(devicePixelRatio || 1, 2);
+  const scale = Math.min(devicePixelRatio || 1, 2) * detail.scale;
   const size = [canvas.clientWidth, canvas.clientHeight].map((side) => Math.round(scale * side));
   if (canvas.width !== size[0] || canvas.height !== size[1]) [canvas.width, canvas.height] = size;
   painter.begin(rgb("ground").map((value) => value / 255));
@@ -354,7 +354,7 @@ function listen() {
 }
 
 function begin() {
-  detail.rested = redraw;
+  detail.changed = redraw;
   $("title").textContent = data.title;
   $("facts").textContent = data.facts;
   $("frame").max = Math.max(last, 0);
