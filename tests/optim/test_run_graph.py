@@ -250,8 +250,11 @@ def test_a_window_of_all_frames_has_the_same_solution():
 
 def test_a_graph_that_does_not_fit_into_memory_is_refused(monkeypatch):
     _, graph = simulated()
-    monkeypatch.setattr("torchslam.optim.run_graph.available_memory", lambda: 200_000)
-    count = len(graph.pixels)
+    count, of_keyframes = len(graph.pixels), int(graph.is_keyframe[graph.frame_index].sum())
+    needed = 2000 * of_keyframes + 300 * (count - of_keyframes)
+    monkeypatch.setattr("torchslam.optim.run_graph.available_memory", lambda: needed)
+    assert solve_graph(graph).success.all()
+    monkeypatch.setattr("torchslam.optim.run_graph.available_memory", lambda: needed - 1)
     with pytest.raises(
         MemoryError, match=rf"{count} observations needs about 0.0 GB.*graph.window\(first, last\)"
     ):
@@ -260,6 +263,27 @@ def test_a_graph_that_does_not_fit_into_memory_is_refused(monkeypatch):
     assert solve_graph(graph).success.all()
     monkeypatch.undo()
     assert available_memory() is None or 1 << 20 < available_memory() < 1 << 50
+
+
+def test_observations_in_runs_give_the_same_gradient(monkeypatch):
+    """With a camera that is free and its prior, whose part comes with the first run alone."""
+    truth, graph = simulated()
+    given = CameraMeasurement.of(graph.camera, 0.02)
+
+    def gradients():
+        leaves = [
+            each.clone().requires_grad_() for each in (graph.pixels, graph.weights, given.camera.params)
+        ]
+        prior = replace(given, camera=given.camera.with_params(leaves[2]))
+        solution = solved_graph(replace(graph, pixels=leaves[0], weights=leaves[1], calibration=prior))
+        return torch.autograd.grad(aligned_error(solution, truth), leaves)
+
+    whole = gradients()
+    for name in ("_sparse.AT_ONCE", "_sparse.EXACT_AT_ONCE", "_solve.AT_ONCE"):
+        monkeypatch.setattr(f"torchslam.optim.bundle.{name}", 37)
+    for part, of_all in zip(gradients(), whole, strict=True):
+        assert float(of_all.norm()) > 0
+        torch.testing.assert_close(part, of_all, rtol=1e-9, atol=1e-9 * float(of_all.abs().max()))
 
 
 def test_submaps_are_solved_independently():

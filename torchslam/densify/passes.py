@@ -20,7 +20,7 @@ import numpy as np
 import torch
 from jaxtyping import Float, UInt8
 from safetensors import SafetensorError
-from safetensors.torch import load_file, save
+from safetensors.torch import load_file
 from torch import Tensor
 
 from torchslam.data.formats.image_file import write_image
@@ -35,6 +35,7 @@ from torchslam.io.export.scene import Images
 from torchslam.io.results import DEPTHS, PICTURE_NAMES, PICTURES
 from torchslam.parallel.pool import SharedTasks
 from torchslam.utils.files import parse_json, read_text, write_whole
+from torchslam.utils.tensor_file import write_tensors
 
 PARTS = "parts"
 JOB = "job.json"
@@ -167,8 +168,7 @@ def _write_alone(job: DenseJob, view: int) -> None:
     found = estimate_depth(gray, sources[None].to(device), views.camera.to(device), poses, *limits)
     confidence = learned_confidence(found, gray, *limits) if job.is_learned else confidence_alone(found)
     tensors = {"inverse_depth": found.inverse_depth[0], "confidence": confidence[0]}
-    content = save({name: rows.cpu().contiguous() for name, rows in tensors.items()})
-    write_whole(job.path(Pass.ALONE, view), content)
+    write_tensors(job.path(Pass.ALONE, view), tensors, {})
 
 
 def _read_alone(path: Path) -> tuple[Float[Tensor, "H W"], Float[Tensor, "H W"]]:

@@ -10,8 +10,7 @@ from typing import Any
 _TRIM_THRESHOLD, _MMAP_THRESHOLD = -1, -3  # of glibc's mallopt
 KEPT_BYTES = 1 << 27
 """Freed memory at the end of the heap up to which nothing is given back. By default, garden mapped as a whole takes 4.9
-million pages anew, and 10.6 s in the system; with this .44 million and 2.5 s. With 1 GB it is .34 million, but a walk
-of 5,000 frames takes 2.5 GB in place of 1.8."""
+million pages anew, and 10.6 s in the system; with this .44 million and 2.5 s, with 1 GB .34 million and 2.1 s."""
 HEAP_BYTES = 1 << 25
 """Size below which memory is of the heap: the highest that glibc accepts. Larger tensors are given back at once."""
 

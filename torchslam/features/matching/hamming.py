@@ -130,8 +130,8 @@ def int8_product(
         return left.float() @ right.float()
     if out is None:
         out = left.new_empty(*left.shape[:-1], right.shape[-1], dtype=torch.int32)
-    matrices = (values.view(-1, *values.shape[-2:]) for values in (left, right, out))
-    for one, other, product in zip(*matrices, strict=True):
+    factors = (values.reshape(-1, *values.shape[-2:]) for values in (left, right))
+    for one, other, product in zip(*factors, out.view(-1, *out.shape[-2:]), strict=True):
         int8_matmul(one, other, out=product)
     return out
 

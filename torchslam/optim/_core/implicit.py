@@ -407,7 +407,8 @@ def _last_gradient(
             grads = torch.autograd.grad(part, wanted, allow_unused=True) if part.requires_grad else ()
             for row, found in enumerate(grads):
                 before = sums[row]
-                sums[row] = before if found is None else found if before is None else before.add_(found)
+                # Not in place: gradients may share memory with each other.
+                sums[row] = before if found is None else found if before is None else before + found
     each = iter(sums)
     return [next(each) if need else None for need in needed]
 
