@@ -84,6 +84,9 @@ def test_features_of_mapping_give_the_same_focal_length(room: Sequence, searched
     assert again(frame) is again(frame)
     assert len(again(frame).mask[0]) == Config().global_mapping.num_keypoints
     assert read == [3]
+    assert again.taken(frame) is kept(frame)  # by the last one who asks, so that it is not kept any longer
+    again(frame)
+    assert read == [3, 3]
 
 
 @pytest.mark.parametrize(

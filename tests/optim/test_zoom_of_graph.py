@@ -100,6 +100,15 @@ def test_a_jump_between_keyframes_is_placed() -> None:
     assert len(with_jumps(zoomed(torch.ones_like), gradual, OPTIONS).frames) == 2
 
 
+def test_observations_in_runs_give_the_same_estimate(monkeypatch: pytest.MonkeyPatch) -> None:
+    graph = zoomed(lambda frame: torch.where(frame >= 20, 1.1, 1.0).double())
+    whole = found(graph)
+    monkeypatch.setattr("torchslam.optim.bundle._scores.EXACT_AT_ONCE", 37)
+    runs = found(graph)
+    torch.testing.assert_close(runs.zoom.ratios, whole.zoom.ratios, rtol=1e-9, atol=0)
+    assert runs.gain.total == pytest.approx(whole.gain.total, rel=1e-9)
+
+
 def test_few_keyframes_say_nothing() -> None:
     graph = zoomed(torch.ones_like)
     assert find_zoom(replace(graph, is_keyframe=graph.frame_ids < 3), GIVEN, OPTIONS) is None
