@@ -327,8 +327,8 @@ class Panel:
             words = f"waits for {self._runs.record(first).title}"
         messages = [line.removeprefix("torchslam: ") for line in log if line.startswith("torchslam: ")]
         has_ended = state in (State.STOPPED, State.FAILED)
-        if has_ended and log and not log[-1].startswith(("torchslam: error: ", INTERRUPTED)):
-            messages.append(f"the run ended unexpectedly: {log[-1]}")
+        if has_ended and not (log and log[-1].startswith(("torchslam: error: ", INTERRUPTED))):
+            messages.append(f"the run ended unexpectedly: {log[-1] if log else 'no message'}")
         lines = [words, *(messages[-SHOWN_MESSAGES:] if state is not State.DONE else [])]
         content = "torchslam: from a video to a map"
         if state is not None:
