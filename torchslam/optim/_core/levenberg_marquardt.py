@@ -33,7 +33,11 @@ from torchslam.utils.torch_internals import in_transform
 INITIAL_DAMPING = 1e-4
 """Relative to the diagonal of the Hessian: nearly a step of Gauss and Newton at first. Tried at this value only."""
 DAMPING_DOWN, DAMPING_UP = 0.1, 10.0
-"""Factors on the damping after a step that lowers the cost, and after one that does not (Marquardt, 1963)."""
+"""Factors on the damping after a step that lowers the cost as predicted, and after another one (Marquardt, 1963)."""
+TRUSTED = 0.25
+"""Least share of the predicted reduction that a step must bring so that the damping falls: a few points far away may
+promise reductions that never come, step after step. On redkitchen, mapped as a whole, rounds of adjustment take 17 and
+13 steps in place of 33 and 56; with .01 they take 17 and 34."""
 _DAMPING_RANGE = (1e-10, 1e8)
 """Below, a step is that of Gauss and Newton; above, it is too short to matter, and the element gives up."""
 CURVATURE_BELOW = 1e-2
@@ -305,12 +309,14 @@ def minimize_batch(
         drifts = torch.zeros_like(active)
         if drifting and bool(accept.all()):
             drifts = active & problem.drifts(model, trial, relative_reduction)  # type: ignore[attr-defined]
+        reduction = model.cost.detach() - trial.cost.detach()
+        trusted = accept & (reduction > TRUSTED * predicted_reduction.detach())
         model = problem.select(accept, trial, model)
         stuck = active & ~accept & (damping >= _DAMPING_RANGE[1])  # no shorter step is to be had
         stuck = stuck | drifts
         given_up = given_up.index_copy(0, rows, stuck)
         active = active & ~stuck
-        damping = torch.where(accept, damping * DAMPING_DOWN, damping * DAMPING_UP).clamp(*_DAMPING_RANGE)
+        damping = torch.where(trusted, damping * DAMPING_DOWN, damping * DAMPING_UP).clamp(*_DAMPING_RANGE)
         if not active.any():
             break
         if divisible and not active.all():

@@ -20,6 +20,7 @@ from torchslam.optim._core.levenberg_marquardt import (
     DAMPING_DOWN,
     DAMPING_UP,
     INITIAL_DAMPING,
+    TRUSTED,
 )
 from torchslam.optim._core.linear import smallest_pivot
 
@@ -63,12 +64,13 @@ def minimize_model(model: M, evaluate: Callable[[Any], M], iterations: int, tole
         trial = evaluate(state)
         converged = not predicted_reduction > tolerance * model.cost
         accepted = trial.cost <= (1 + 1e-13) * model.cost  # an increase by rounding does not reject a step
+        trusted = accepted and model.cost - trial.cost > TRUSTED * predicted_reduction
         if accepted:
             use_curvature = predicted_reduction < CURVATURE_BELOW * model.cost
             model = trial
         if converged:
             break
-        damping *= DAMPING_DOWN if accepted else DAMPING_UP
+        damping *= DAMPING_DOWN if trusted else DAMPING_UP
     return model
 
 
