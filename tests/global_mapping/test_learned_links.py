@@ -212,7 +212,7 @@ def test_learned_links_are_kept_where_pairs_prefer_the_map(
     monkeypatch.setattr("torchslam.global_mapping.mapper.open_links", lambda *_: [([4], [5])])
     monkeypatch.setattr(mapper, "_saved_views", lambda _: VIEWS)
     monkeypatch.setattr(mapper, "_learned", lambda *_: TIED)
-    monkeypatch.setattr(mapper, "reconstruct", lambda *_: next(maps))
+    monkeypatch.setattr(mapper, "reconstruct", lambda *_, **__: next(maps))
     monkeypatch.setattr(mapper, "_check", lambda *_: next(checks))
     monkeypatch.setattr(mapper, "posed", lambda *_: (None, None, None))
     monkeypatch.setattr(mapper, "adjusted", lambda *_: None)

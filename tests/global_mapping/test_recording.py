@@ -90,7 +90,8 @@ class World:
                 self.config = config
 
             def run(self, results: Any, before: Run) -> SimpleNamespace:
-                assert before.results is results  # keypoints are corrected by the run they come from
+                # Keypoints are corrected by the run that the results come from.
+                assert [each.index for each in before.results] == [each.index for each in results]
                 world.mapped.append(results)
                 return SimpleNamespace(
                     run=world.whole,

@@ -27,6 +27,7 @@ from torchslam.global_mapping.view_graph import ViewPair
 from torchslam.global_mapping.windows import (
     MIN_HOLDING,
     MIN_JOINING,
+    KnownPoses,
     MappedWindow,
     join_windows,
     pairs_kept,
@@ -218,6 +219,36 @@ def test_a_map_in_windows_is_the_map_of_the_whole() -> None:
     assert rows == list(range(40))
     assert apart(windowed, whole)[0] < 1e-3 * float(se3_inverse(SCENE.T_cw)[:, 0, 3].max())
     assert apart(windowed, SCENE.T_cw)[0] < 5e-3
+
+
+@pytest.mark.parametrize(
+    ("doubtful", "off", "anew"),
+    [([], 0.0, []), ([20], 0.0, [8, 17]), ([2, 3, 36], 0.0, [0, 25]), ([], 0.3, [0, 8, 17, 25])],
+)
+def test_windows_without_a_doubtful_image_enter_as_they_are(
+    doubtful: list[int], off: float, anew: list[int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Unless the images contradict the poses, here by rotations that are off by 0.3 radians."""
+    begun, begin = list[int](), CoarseMapper.map
+
+    def counted(self: CoarseMapper, views: list[FrameFeatures], *pairs: list[ViewPair]) -> CoarseMap | str:
+        begun.append(views[0].index - SCENE.views[0].index)
+        return begin(self, views, *pairs)
+
+    monkeypatch.setattr(CoarseMapper, "map", counted)
+    assert [window.start for window in split(40, 15)] == [0, 8, 17, 25]
+    is_tied = torch.ones(40, dtype=torch.bool)
+    is_tied[doubtful] = False
+    S = similarity(3)
+    T_ca = without_scale(SCENE.T_cw @ torch.linalg.inv(S))
+    turns = off * torch.randn(40, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    T_ca[:, :3, :3] = so3_exp(turns) @ T_ca[:, :3, :3]
+    T_ca[doubtful, :3, 3] = 7.0  # what is doubtful is not used
+    found = mapper(15).reconstruct(SCENE.views, SCENE.pairs(1, 2, 3), known=KnownPoses(T_ca, is_tied, CAMERA))
+    assert not isinstance(found, str)
+    assert begun == anew
+    assert found[0].tolist() == list(range(40))
+    assert apart(found[2].T_cw, SCENE.T_cw)[0] < 5e-3
 
 
 def test_an_image_that_only_other_windows_see_has_a_pose() -> None:

@@ -14,9 +14,16 @@ from torch import Tensor
 from torchslam.geometry import Camera, rigid
 from torchslam.geometry.camera_measurement import CameraMeasurement
 from torchslam.global_mapping.baselines import chained_positions
-from torchslam.global_mapping.rounds import MIN_VIEWS, ObservedTracks, Reconstruction, adjust_coarsely
+from torchslam.global_mapping.rounds import (
+    COARSE_GATE,
+    FINE,
+    MIN_VIEWS,
+    ObservedTracks,
+    Reconstruction,
+    adjust_coarsely,
+)
 from torchslam.global_mapping.view_graph import Relation, ViewPair, connected_views
-from torchslam.global_mapping.windows import rotations_hold
+from torchslam.global_mapping.windows import KnownPoses, rotations_hold
 from torchslam.optim import ROTATION_OPTIONS
 from torchslam.optim.rotation_averaging import solve_rotations
 from torchslam.types import FrameFeatures
@@ -27,6 +34,10 @@ real recordings, with a long tail. Tried 0.005 to 0.02."""
 MIN_GENERAL = 0.2
 """Least share of pairs that determine a direction of motion: a camera that only turns has none, or, with a wrong focal
 length, a few; walks have 0.8 and more."""
+LEAST_AGREEING = 0.8
+"""Least share of the observations of the longest tracks that known poses must agree with; else the images are mapped
+anew. Windows of machine_hall (20 images) and redkitchen (40) have .96 to .99 by the poses of the online map. Tried at
+this value only."""
 
 
 class CoarseMap(NamedTuple):
@@ -93,6 +104,19 @@ class CoarseMapper:
         centers_w = chained_positions(pairs, average.R_cw, views, self.camera)
         T_cw = rigid(average.R_cw, -(average.R_cw @ centers_w[..., None])[..., 0])
         return self.adjust(views, pairs[:own], pairs[own:], T_cw, camera, [])
+
+    def keep(
+        self, known: KnownPoses, views: list[FrameFeatures], pairs: list[ViewPair], learned: list[ViewPair]
+    ) -> CoarseMap | None:
+        """The points of views whose poses are known, which stay as they are; None where too few agree."""
+        held = [
+            list(compress(each, rotations_hold(each, known.T_cw[:, :3, :3]))) for each in (pairs, learned)
+        ]
+        observed = ObservedTracks.join(held[0] + held[1], views).longest()
+        found = observed.triangulate(known.T_cw, known.camera, COARSE_GATE * FINE[1])
+        if float(found.agrees.sum()) < LEAST_AGREEING * max(len(found.agrees), 1):
+            return None
+        return CoarseMap(*held, observed, found, [])
 
     def adjust(
         self,

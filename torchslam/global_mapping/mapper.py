@@ -43,6 +43,7 @@ from torchslam.global_mapping.saved_stages import SavedStages
 from torchslam.global_mapping.tracks import keypoints_of_tracks, make_map
 from torchslam.global_mapping.view_graph import PairMatcher, ViewPair, build_view_graph
 from torchslam.global_mapping.windows import (
+    KnownPoses,
     MappedWindow,
     join_windows,
     pairs_kept,
@@ -230,7 +231,8 @@ class GlobalMapper:
         """Map the recording.
 
         results: of an online run over it, whose doubtful frames are mapped as well
-        before: that run, whose readout and velocities correct keypoints for a rolling shutter
+        before: that run, whose readout and velocities correct keypoints for a rolling shutter; of a long recording,
+            windows without a doubtful frame keep its poses
         """
         if learned_config(self.config) is not None and self.extract is None:
             raise ConfigError(
@@ -249,7 +251,8 @@ class GlobalMapper:
         return_freed_memory()
         held_back = choose_held_back(pairs)
         used = [pair for row, pair in enumerate(pairs) if row not in held_back]
-        found = self.reconstruct(views, used)
+        known = None if before is None else known_poses(before, results, views)
+        found = self.reconstruct(views, used, known=known)
         if isinstance(found, str):
             return self._failed(found, views, pairs)
         doubtful: frozenset[int] = frozenset()
@@ -258,7 +261,7 @@ class GlobalMapper:
             every, left_out = pairs + learned.pairs, choose_held_back(learned.pairs)
             kept = [pair for row, pair in enumerate(learned.pairs) if row not in left_out]
             left_out = held_back | {len(pairs) + row for row in left_out}
-            tied = self.reconstruct(views, used, LearnedPairs(learned.views, kept))
+            tied = self.reconstruct(views, used, LearnedPairs(learned.views, kept), known)
             if not isinstance(tied, str):
                 first, after = (self._check(made, learned.views, every, left_out) for made in (found, tied))
                 times = middle_times(learned.views, every, left_out)
@@ -308,12 +311,23 @@ class GlobalMapper:
         return with_learned(views, found, pairs) if pairs else None
 
     def reconstruct(
-        self, views: list[FrameFeatures], pairs: list[ViewPair], learned: LearnedPairs | None = None
+        self,
+        views: list[FrameFeatures],
+        pairs: list[ViewPair],
+        learned: LearnedPairs | None = None,
+        known: KnownPoses | None = None,
     ) -> Reconstructed | str:
         """Map the largest set of views that pairs connect: coarsely, together or in windows, then all exactly.
 
-        Returns the rows of the views that have a pose, the tracks in all views, and the reconstruction; or the reason
-        why there is no map. `learned`: more keypoints of the same images, with verified pairs.
+        Args:
+            views: images.
+            pairs: verified pairs of them.
+            learned: more keypoints of the same images, with verified pairs.
+            known: poses that windows without a doubtful image keep until all are adjusted; None: there are none.
+
+        Returns:
+            The rows of the views that have a pose, the tracks in all views, and the reconstruction; or the reason why
+            there is no map.
         """
         matcher, more = PairMatcher(views, self.camera, self.matcher, self.config), list[ViewPair]()
         if learned is not None:
@@ -323,7 +337,7 @@ class GlobalMapper:
         begun = (
             coarse.map(views, pairs, more)
             if len(windows) == 1
-            else self._map_in_windows(coarse, windows, views, pairs, more)
+            else self._map_in_windows(coarse, windows, views, pairs, more, known)
         )
         if isinstance(begun, str):
             return begun
@@ -344,6 +358,7 @@ class GlobalMapper:
         views: list[FrameFeatures],
         pairs: list[ViewPair],
         learned: list[ViewPair],
+        known: KnownPoses | None,
     ) -> CoarseMap | str:
         """Map windows of views, each in one of the processes, and give them a common world."""
         slim = [replace(view, descriptors=view.descriptors[:, :0]) for view in views]
@@ -353,6 +368,7 @@ class GlobalMapper:
                 slim[window.start : window.stop],
                 pairs_within(pairs, window),
                 pairs_within(learned, window),
+                None if known is None else known.of(window),
             )
             for window in windows
         ]
@@ -368,13 +384,13 @@ class GlobalMapper:
         if not mapped:
             return next(made for made in ordered if isinstance(made, str))
         self.progress("joining", 0, 1)
-        T_cw, known = join_windows(mapped, pairs + learned, views)
+        T_cw, is_posed = join_windows(mapped, pairs + learned, views)
         own, more = (
-            pairs_that_hold(pairs_kept(every, windows, (made.kept[at] for made in mapped)), T_cw, known)
+            pairs_that_hold(pairs_kept(every, windows, (made.kept[at] for made in mapped)), T_cw, is_posed)
             for at, every in enumerate((pairs, learned))
         )
         camera = max(mapped, key=lambda part: int(part.found.agrees.sum())).found.camera
-        posed = set(known.nonzero()[:, 0].tolist())
+        posed = set(is_posed.nonzero()[:, 0].tolist())
         unposed = [pair for pair in pairs + learned if not {pair.first, pair.second} <= posed]
         return coarse.adjust(views, own, more, T_cw, camera, unposed)
 
@@ -547,9 +563,17 @@ def map_window(
     views: list[FrameFeatures],
     pairs: list[ViewPair],
     learned: list[ViewPair],
+    known: KnownPoses | None,
 ) -> MappedWindow | str:
-    """Map a window of images, or read the map that an earlier run saved; the reason where there is none."""
-    made = saved.window(views, pairs, learned, coarse.camera, coarse.map)
+    """Map a window of images, or read the map that an earlier run saved; the reason where there is none.
+
+    With known poses it enters as it is, unless the images do not agree with them.
+    """
+    made: CoarseMap | str | None = None
+    if known is not None:
+        made = coarse.keep(known, views, pairs, learned)
+    if made is None:
+        made = saved.window(views, pairs, learned, coarse.camera, coarse.map)
     if isinstance(made, str):
         return made
     kept = tuple(
@@ -557,6 +581,14 @@ def map_window(
         for every in (made.pairs, made.learned)
     )
     return MappedWindow(made.observed, made.found, window.start, kept)
+
+
+def known_poses(run: Run, results: Rows[StepResult], views: list[FrameFeatures]) -> KnownPoses:
+    """The poses of views in the main submap of a run; `results`: which frames are doubtful."""
+    T_cw, is_posed = poses_of(run, views)
+    sure = {result.index for result in results if result.state is State.TRACKING}
+    is_sure = torch.tensor([view.index in sure for view in views], dtype=torch.bool, device="cpu")
+    return KnownPoses(T_cw, is_posed & is_sure, run.camera)
 
 
 def choose_held_back(pairs: list[ViewPair]) -> frozenset[int]:

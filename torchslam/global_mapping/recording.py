@@ -241,10 +241,11 @@ def map_recording(
         return MappedRun.of(online, Mapping.ONLINE)
     check, camera = None, camera.to(device)
     why = _loss(online) if go_on is None else f"tracking was lost at frame {online.results[-1].index}"
-    if not why or mapping is Mapping.ONLINE:
+    is_long = len(online.results) > config.global_mapping.window_images
+    if not why or mapping is Mapping.ONLINE or is_long:
         progress("check", 0, 1)
         check = check_run(online)
-        if check is not None and not check.is_right:
+        if not why and check is not None and not check.is_right:
             why = f"the check of the online map failed: {check.sentence()}"
     if mapping is Mapping.ONLINE or (mapping is Mapping.AUTO and not why):
         return MappedRun.of(online, Mapping.ONLINE, check)
@@ -261,7 +262,7 @@ def map_recording(
         kept=features,
         processes=processes,
     )
-    made = mapper.run(online.results, online)
+    made = mapper.run(with_doubts(online.results, check), online)
     reduction = mapper.config.features.reduction(camera.size)
 
     def checked(run: Run) -> MapCheck:

@@ -75,6 +75,27 @@ class MappedWindow(NamedTuple):
         return found
 
 
+class KnownPoses(NamedTuple):
+    """Poses of images by a run frame by frame.
+
+    Attributes:
+        T_cw: of all images.
+        is_tied: images that have a pose, and that the run and its check do not doubt.
+        camera: of the run.
+    """
+
+    T_cw: Float[Tensor, "K 4 4"]
+    is_tied: Bool[Tensor, " K"]
+    camera: Camera
+
+    def of(self, window: range) -> KnownPoses | None:
+        """Those of a window that enters as it is; None where an image is doubtful."""
+        rows = slice(window.start, window.stop)
+        return (
+            KnownPoses(self.T_cw[rows], self.is_tied[rows], self.camera) if self.is_tied[rows].all() else None
+        )
+
+
 def split(count: int, size: int) -> list[range]:
     """Windows of `size` of `count` images, evenly spread, that overlap by `OVERLAP` or more; one if they are few."""
     if count <= size:
