@@ -9,6 +9,7 @@ import string
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 from hypothesis import given
@@ -62,6 +63,24 @@ def test_one_run_goes_on_at_a_time_and_the_next_follows(runs: Runs) -> None:
     wait_until(lambda: runs.running() is None)
     runs.delete(first)
     assert first not in runs.names()
+
+
+def test_a_run_is_queued_until_its_process_holds_the_lock(
+    runs: Runs, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    name, real, seen = runs.add("walk.mp4", DEMO), jobs.subprocess.Popen, list[State]()
+
+    def begin(words: list[str], **options: Any) -> subprocess.Popen[bytes]:
+        seen.append(runs.state(name))
+        return real(words, **options)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(jobs.subprocess, "Popen", begin)
+        patched.setattr(jobs, "is_held", lambda path: False)  # who looks just before the lock is taken
+        runs.advance()
+    assert seen == [State.QUEUED]
+    assert runs.state(name) is State.RUNNING
+    runs.stop(name)
 
 
 def test_another_server_finds_a_run_that_goes_on_and_keeps_what_has_ended(runs: Runs) -> None:

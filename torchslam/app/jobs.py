@@ -98,9 +98,10 @@ class Runs:
     def state(self, name: str) -> State:
         """The state of a run, from its folder."""
         path = self.path(name)
+        is_queued = (path / QUEUE).exists()  # looked at first: it goes only once the lock is held
         if is_held(path):
             return State.RUNNING
-        if (path / QUEUE).exists():
+        if is_queued:
             return State.QUEUED
         if is_begun(path):
             return State.STOPPED
@@ -184,8 +185,10 @@ class Runs:
                 return
             if waiting and self.running() is None:
                 first = min(waiting, key=time_of)
-                first.unlink()
-                self._start(first.parent.name)
+                try:
+                    self._start(first.parent.name)
+                finally:
+                    first.unlink()
 
     def command(self, name: str) -> list[str]:
         """The words after `torchslam` of the command of a run, with absolute paths.

@@ -51,6 +51,7 @@ class Panel:
         self._shown, self._is_live, self._frame = "", False, -1  # the run that is shown, and its frame
         self._upload: tuple[Path, str] | None = None
         self._rows = list[int]()  # points that were measured
+        self._told = ""  # the last error that no user caused
         self._viewer, self._flight = viewer, threading.Event()  # set: the path is not played
         self._flight.set()
         viewer.gui.configure_theme(control_width="large", show_logo=False, show_share_button=False)
@@ -352,16 +353,20 @@ class Panel:
         def guarded(event: Any) -> None:
             try:
                 with self._lock:
-                    action(event)
-                    self._refresh()
+                    try:
+                        action(event)
+                    finally:
+                        self._refresh()  # the status never stays that of before
             except Exception as error:  # the page goes on, whatever it is
                 if not isinstance(error, TorchslamError | OSError):
                     traceback.print_exc()
-                words = printable(without_paths(str(error), self._runs.folder))
-                if event is not None and event.client is not None:
-                    event.client.add_notification("That did not work", words, color="red")
-                else:
-                    self._status.content = line_of(words, "#c92a2a")
+                words = printable(without_paths(str(error) or type(error).__name__, self._runs.folder))
+                is_users = event is not None and event.client is not None
+                if not is_users and words == self._told:
+                    return  # the same every second
+                self._told = self._told if is_users else words
+                for client in [event.client] if is_users else self._viewer.get_clients().values():
+                    client.add_notification("That did not work", words, color="red")
 
         return guarded
 
