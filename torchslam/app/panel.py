@@ -289,16 +289,12 @@ class Panel:
         if self._runs.state(self._shown) not in GOING_ON:
             self._open(self._shown)
             return
-        path, words = self._runs.path(self._shown), tuple(self._runs.command(self._shown)[1:])
-        try:
-            found = self._reader.call(reading.live, path, words, self._frame)
-        except (TorchslamError, OSError) as error:  # the run goes on
-            self._image.label, self._image.visible = f"not shown: {error}", True
-            return
-        if found is not None:
+        found = reading.live(self._runs.path(self._shown))
+        if found is not None and int(found["frame"]) != self._frame:
             self._frame = int(found["frame"])
             self._scene.show_live(found)
-            self._image.image, self._image.label, self._image.visible = found["image"], None, True
+            self._image.visible = found["image"].size > 0
+            self._image.image = found["image"] if self._image.visible else EMPTY
 
     def _refresh(self) -> None:
         """Start what waits, and update the status and the lists."""
