@@ -177,6 +177,7 @@ def test_a_length_is_measured_and_a_colmap_model_is_taken_away(
     draw(page, "app-result")
 
     open_tab(page, "Take away")
+    page.get_by_text(re.compile(r"torchslam align \S+ --distance \d+:\S+ \d+:\S+ 1")).wait_for()
     with page.expect_download(timeout=SLOW_MS) as download:
         page.get_by_text("COLMAP (zip)").click()
     with zipfile.ZipFile(download.value.path()) as archive:

@@ -100,7 +100,7 @@ class Panel:
         self._source = self._gui.add_html(line_of("Drop a video, a zip of images or several photos, or:"))
         self._gui.add_html(file_button("Choose a video or photos", "recording", "#228be6;color:#fff"))
         self._recording = self._gui.add_dropdown("In the folder", (NONE, *self._runs.recordings()))
-        demo = self._button("Demo: a rendered room", lambda _: self._open(self._runs.add("demo room", DEMO)))
+        demo = self._button("Demo: a rendered room", lambda _: self.begin(self._runs.add("demo room", DEMO)))
         demo.color = "gray"
         self._options = Options(self._gui)
         self._button("Start", lambda _: self._start())
@@ -149,7 +149,12 @@ class Panel:
         else:
             raise ResultsError("choose a recording first")
         self._source.content = line_of("Drop the next recording on the page, or:")
-        self._open(name)
+        self.begin(name)
+
+    def begin(self, name: str) -> None:
+        """Show a run that was just added, unless one that goes on is shown, for which it waits."""
+        if not self._shown or self._runs.state(self._shown) is not State.RUNNING:
+            self._open(name)
 
     def _open(self, name: str) -> None:
         """Show a run: its map so far, or its result; nothing for an empty name."""
@@ -173,7 +178,8 @@ class Panel:
         self._timeline.image, self._timeline.visible = data["timeline"], True
         self._links.content = exports.links(f"/runs/{quote(name, safe='')}")
         if self._runs.record(name).source:
-            words = exports.command_and_python(self._runs.command(name), self._runs.folder)
+            lengths = self._runs.record(name).lengths
+            words = exports.command_and_python(self._runs.command(name), self._runs.folder, lengths)
             self._commands.content = f'<pre style="{PRE}">{html.escape(words)}</pre>'
         self._row.max = max(1, len(data["submap"].get("poses", ())) - 1)
 
@@ -248,8 +254,7 @@ class Panel:
         clicks = [click for row in self._rows if (click := click_of(self._scene.submap, row))]
         if len(clicks) != 2:
             raise ResultsError("no frame of the run shows both points: click other ones")
-        path, meters = str(self._runs.path(self._shown)), f"{self._meters.value:g}"
-        tool(["align", path, "--distance", *clicks, meters])
+        self._runs.scale(self._shown, [*clicks, f"{self._meters.value:g}"])
         self._open(self._shown)
 
     def _crop_scene(self) -> None:
@@ -299,34 +304,34 @@ class Panel:
     def _refresh(self) -> None:
         """Start what waits, and update the status and the lists."""
         self._runs.advance()
-        names, rows = self._runs.names(), list[str]()
+        names, rows, others = self._runs.names(), list[str](), list[str]()
         for name in names:
             state, took = self._runs.state(name), self._runs.seconds(name)
+            if name != self._shown and state in GOING_ON:
+                others.append(f"{self._runs.record(name).title}: {state.value}")
             image = f'<img src="/runs/{quote(name, safe="")}/picture" alt="" style="{PICTURE}">'
             words = f"<b>{html.escape(self._runs.record(name).title)}</b><br>{html.escape(name)}<br>"
             words += state.value + (f", {took:.0f} s" if took else "")
             rows.append(f'<div style="{ROW}">{image if state is State.DONE else ""}<div>{words}</div></div>')
         self._list.content = "".join(rows) or line_of("No runs yet.")
-        others = [name for name in names if name != self._shown]
-        lists = ((self._chosen, names), (self._other, others), (self._recording, self._runs.recordings()))
+        comparable = [name for name in names if name != self._shown]
+        lists = ((self._chosen, names), (self._other, comparable), (self._recording, self._runs.recordings()))
         for each, values in lists:
             if each.options != (NONE, *values):
                 each.options = (NONE, *values)
         self._shown = self._shown if self._shown in names else ""
-        self._refresh_status()
+        self._refresh_status(others)
 
-    def _refresh_status(self) -> None:
-        """Update what is above the tabs: state, progress and messages of the run that is shown."""
+    def _refresh_status(self, others: list[str]) -> None:
+        """Update what is above the tabs: state, progress and messages of the run that is shown; and other runs."""
         state = self._runs.state(self._shown) if self._shown else None
         log = log_tail(self._runs.path(self._shown)) if self._shown else []
         words, share = progress_of(log) if state is State.RUNNING else ("", 0.0)
-        if state is State.QUEUED and (first := self._runs.running()):
-            words = f"waits for {self._runs.record(first).title}"
         messages = [line.removeprefix("torchslam: ") for line in log if line.startswith("torchslam: ")]
         has_ended = state in (State.STOPPED, State.FAILED)
         if has_ended and not (log and log[-1].startswith(("torchslam: error: ", INTERRUPTED))):
             messages.append(f"the run ended unexpectedly: {log[-1] if log else 'no message'}")
-        lines = [words, *(messages[-SHOWN_MESSAGES:] if state is not State.DONE else [])]
+        lines = [words, *(messages[-SHOWN_MESSAGES:] if state is not State.DONE else []), *others]
         content = "torchslam: from a video to a map"
         if state is not None:
             content = f"<b>{html.escape(self._runs.record(self._shown).title)}</b>: {state.value}"
