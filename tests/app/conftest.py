@@ -54,7 +54,7 @@ def stop_server(server: Server) -> None:
     server.process.wait(30)
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="module")  # what one module chose for the next run is not for another one
 def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
     for module in ("viser", "starlette", "uvicorn"):
         pytest.importorskip(module, reason=f"the page needs {module}: pip install 'torchslam[app]'")

@@ -123,6 +123,20 @@ def test_the_number_of_runs_is_limited(runs: Runs) -> None:
         runs.add("5", DEMO, ())
 
 
+def test_a_run_whose_files_cannot_be_copied_is_not_added_and_its_upload_stays(
+    runs: Runs, tmp_path: Path
+) -> None:
+    upload, folder = tmp_path / "input.mp4", tmp_path / "gps"
+    upload.write_bytes(b"x")
+    folder.mkdir()
+    for wrong in (folder, tmp_path / "missing.csv"):
+        with pytest.raises(OSError, match=wrong.name):
+            runs.add("walk.mp4", "", (), upload, [wrong])
+        assert upload.exists()
+        assert not list(runs.folder.iterdir())
+    assert (runs.path(runs.add("walk.mp4", "", (), upload)) / "input.mp4").exists()
+
+
 def test_only_names_of_runs_are_accepted(runs: Runs, tmp_path: Path) -> None:
     (tmp_path / METRICS).write_text("{}")  # the parent folder looks like a run
     (runs.folder / "video.mp4").write_bytes(b"x")

@@ -145,12 +145,16 @@ class Runs:
             paths = (self.folder / (stem + end) for end in ("", *(f"-{n}" for n in range(2, 100))))
             path = next(path for path in paths if not path.exists())
             path.mkdir()
-            if upload is not None:
-                upload.rename(path / upload.name)
-                source = f"{path.name}/{upload.name}"
-            for each in files:
-                shutil.copyfile(each, path / each.name)
-            write_record(path, Record(shown(title), source, arguments))
+            try:
+                for each in files:
+                    shutil.copyfile(each, path / each.name)
+                source = source if upload is None else f"{path.name}/{upload.name}"
+                write_record(path, Record(shown(title), source, arguments))
+                if upload is not None:
+                    upload.rename(path / upload.name)
+            except OSError:
+                shutil.rmtree(path)  # the upload is still where it was
+                raise
             (path / QUEUE).touch()
         return path.name
 

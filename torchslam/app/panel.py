@@ -88,6 +88,8 @@ class Panel:
             words = f"{called}: {about.get('frames', '?')} frames, {about.get('size', '')}. Start it below."
             self._source.content = line_of(words, "#2b8a3e")
         elif kind in FILE_KINDS:
+            if path.is_dir():
+                raise ResultsError(f"one {FILE_KINDS[kind]} is needed, not several files")
             self._options.take(kind, path.rename(path.with_name(f"{kind}{path.suffix}")))
         elif kind == "truth":
             self._compare(path, called, is_truth=True)
@@ -290,7 +292,6 @@ class Panel:
 
     def _follow(self) -> None:
         """Show the map so far of the run that is shown; its result once it has ended."""
-        self._runs.advance()  # also if the images cannot be read
         if self._runs.state(self._shown) not in GOING_ON:
             self._open(self._shown)
             return
