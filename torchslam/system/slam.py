@@ -147,7 +147,7 @@ class SLAM:
         self.session, self.atlas, self.mapping = session, session.atlas, session.mapping
         self.last_frame = last_frame
         self.last_features: FrameFeatures | None = None  # of the last frame, before masking
-        self.last_picture: Tensor | None = None  # of the last frame, if it brought one
+        self.last_picture: torch.Tensor | None = None  # of the last frame, if it brought one
         self.tracker = self.tracker.for_session(session.mapping)
         self.mapper.adjustment.drop()
         self.loop_closer = LoopCloser(self.shared_camera, self.config, self.atlas, self.matcher)
