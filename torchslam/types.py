@@ -34,6 +34,7 @@ class Frame(ByValue):
         mask: True where features may be found; None: everywhere.
         features: a batch of one, if they were extracted already; then the image is not needed, and H and W may be 0.
         backlog: number of newer frames already queued (live sources only).
+        picture: small RGB image, to be shown, where the image itself stays with a worker that read it.
     """
 
     index: int
@@ -44,6 +45,7 @@ class Frame(ByValue):
     mask: Bool[Tensor, "1 1 H W"] | None = None
     features: Features | None = None
     backlog: int = 0
+    picture: UInt8[Tensor, "h w 3"] | None = None
 
 
 @dataclass(frozen=True, eq=False)

@@ -27,7 +27,7 @@ VIDEO_FRAMES = 40
 class Server:
     """A server that runs."""
 
-    process: subprocess.Popen[str]
+    process: subprocess.Popen[bytes]
     folder: Path
     address: str
     token: str
@@ -39,12 +39,14 @@ class Server:
 
 def start_server(folder: Path, *options: str) -> Server:
     command = [sys.executable, "-m", "torchslam", "app", str(folder), "--no-browser", "--port", "0", *options]
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
-    assert process.stdout is not None
-    for line in process.stdout:
-        if found := re.match(r"torchslam app: (http://\S+:\d+/)(?:\?token=(\S+))?", line):
-            return Server(process, folder, found[1], found[2] or "")
-    raise AssertionError(f"the server ended with {process.wait()}")
+    output = folder.with_suffix(".log")  # a pipe that nobody reads fills, and then the server hangs
+    with output.open("wb") as log:
+        process = subprocess.Popen(command, stdout=log, stderr=log)
+    pattern = r"torchslam app: (http://\S+:\d+/)(?:\?token=(\S+))?"
+    wait_until(lambda: process.poll() is not None or re.search(pattern, output.read_text()))
+    found = re.search(pattern, output.read_text())
+    assert found is not None, output.read_text()
+    return Server(process, folder, found[1], found[2] or "")
 
 
 def stop_server(server: Server) -> None:
@@ -52,7 +54,7 @@ def stop_server(server: Server) -> None:
     server.process.wait(30)
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="module")  # what one module chose for the next run is not for another one
 def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
     for module in ("viser", "starlette", "uvicorn"):
         pytest.importorskip(module, reason=f"the page needs {module}: pip install 'torchslam[app]'")

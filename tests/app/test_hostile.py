@@ -7,10 +7,11 @@ import http.client
 import io
 import json
 import os
+import re
 import socket
 import stat
 import zipfile
-from collections.abc import Iterator
+from collections.abc import AsyncIterator, Iterator
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
@@ -225,15 +226,35 @@ def test_hostile_names_of_files_are_stored_as_plain_ones(server: Server) -> None
 
     before = elsewhere()
     for name in HOSTILE_NAMES:
-        for names in ([name], [name, name]):
-            upload = announce(server, *((each, 1) for each in names))
-            status, answer = send(server, upload, b"x" * len(names), "gps")
-            assert status == 200, (name, answer)
-            stored = list((server.folder / ".uploads" / upload).rglob("*"))
-            assert stored
-            assert all(each.name.isascii() and each.name[:3] in ("gps", "000") for each in stored), stored
+        upload = announce(server, (name, 1))
+        status, answer = send(server, upload, b"x", "gps")
+        assert status == 200, (name, answer)
+        (stored,) = (server.folder / ".uploads" / upload).iterdir()
+        assert stored.name.isascii()
+        assert stored.name.startswith("gps")
+        status, answer = send(server, announce(server, (name, 1), (name, 1)), b"xx", "gps")
+        assert status == 422, name  # a run would have one
+        assert "several" in answer
     assert elsewhere() == before
     assert len(list((server.folder / ".uploads").iterdir())) == 1  # those before it are deleted
+
+
+def test_hostile_names_of_several_files_are_stored_as_plain_ones(tmp_path: Path) -> None:
+    from torchslam.app.web import Uploads
+
+    uploads, stored = Uploads(tmp_path / "results", 1 << 20), list[str]()
+
+    def take(kind: str, path: Path, called: str) -> None:
+        stored.extend(each.name for each in path.iterdir())
+
+    async def chunks() -> AsyncIterator[bytes]:
+        yield b"x" * len(HOSTILE_NAMES)
+
+    upload = uploads.announce(json.dumps([(name, 1) for name in HOSTILE_NAMES]).encode())
+    asyncio.run(uploads.receive(upload, "recording", chunks(), take))
+    assert [name[:5] for name in sorted(stored)] == [f"{number:05d}" for number in range(len(HOSTILE_NAMES))]
+    assert all(re.fullmatch(r"\d{5}(\.[a-z0-9]{1,8})?", name) for name in stored)
+    assert {each.name for each in tmp_path.iterdir()} == {"results"}
 
 
 def test_uploads_that_lie_about_themselves_are_refused_and_deleted(server: Server) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import json
 import os
 import signal
@@ -9,6 +10,7 @@ import string
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 from hypothesis import given
@@ -19,8 +21,11 @@ from torchslam.app import jobs
 from torchslam.app.exports import command_and_python, write_export, zip_folder
 from torchslam.app.jobs import DEMO, LOCK, LOG, RECORD, Record, Runs, State
 from torchslam.app.options import check_arguments
+from torchslam.config import load_config
 from torchslam.errors import ConfigError, ResultsError
 from torchslam.io.file_names import CHECKPOINT, METRICS
+from torchslam.metric.distances import Distances
+from torchslam.metric.options import given_options, sources_of
 
 SLEEPS = """
 import time
@@ -64,6 +69,24 @@ def test_one_run_goes_on_at_a_time_and_the_next_follows(runs: Runs) -> None:
     assert first not in runs.names()
 
 
+def test_a_run_is_queued_until_its_process_holds_the_lock(
+    runs: Runs, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    name, real, seen = runs.add("walk.mp4", DEMO), jobs.subprocess.Popen, list[State]()
+
+    def begin(words: list[str], **options: Any) -> subprocess.Popen[bytes]:
+        seen.append(runs.state(name))
+        return real(words, **options)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(jobs.subprocess, "Popen", begin)
+        patched.setattr(jobs, "is_held", lambda path: False)  # who looks just before the lock is taken
+        runs.advance()
+    assert seen == [State.QUEUED]
+    assert runs.state(name) is State.RUNNING
+    runs.stop(name)
+
+
 def test_another_server_finds_a_run_that_goes_on_and_keeps_what_has_ended(runs: Runs) -> None:
     name = runs.add("walk.mp4", DEMO, ())
     runs.advance()
@@ -98,6 +121,20 @@ def test_the_number_of_runs_is_limited(runs: Runs) -> None:
         runs.add(f"{number}", DEMO, ())
     with pytest.raises(ResultsError, match="--max-runs"):
         runs.add("5", DEMO, ())
+
+
+def test_a_run_whose_files_cannot_be_copied_is_not_added_and_its_upload_stays(
+    runs: Runs, tmp_path: Path
+) -> None:
+    upload, folder = tmp_path / "input.mp4", tmp_path / "gps"
+    upload.write_bytes(b"x")
+    folder.mkdir()
+    for wrong in (folder, tmp_path / "missing.csv"):
+        with pytest.raises(OSError, match=wrong.name):
+            runs.add("walk.mp4", "", (), upload, [wrong])
+        assert upload.exists()
+        assert not list(runs.folder.iterdir())
+    assert (runs.path(runs.add("walk.mp4", "", (), upload)) / "input.mp4").exists()
 
 
 def test_only_names_of_runs_are_accepted(runs: Runs, tmp_path: Path) -> None:
@@ -238,3 +275,27 @@ def test_the_lines_of_python_are_those_of_the_command(tmp_path: Path) -> None:
     compile(lines, "lines", "exec")
     assert "'seed=3', 'metric.marker=aruco-4x4:0.1'" in lines
     assert json.dumps(str(tmp_path))[1:-1] not in text
+
+
+def test_a_length_that_was_set_is_in_the_commands_and_in_the_python(
+    runs: Runs, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked = list[list[str]]()
+    monkeypatch.setattr(jobs, "tool", lambda words: asked.append(list(words)))
+    name = runs.add("walk.mp4", DEMO, ("--mapping", "online"))
+    runs.scale(name, ["3:1.5,2", "4:100,20.5", "0.297"])
+    runs.scale(name, ["3:1.5,2", "9:7,8", "2"])
+    record = runs.record(name)
+    text = command_and_python(runs.command(name), runs.folder, record.lengths)
+    _, first, second, _, *lines = text.splitlines()
+    assert first.split()[1:] == [*asked[0][:1], name, *asked[0][2:]]
+    assert second == f"torchslam align {name} --distance 3:1.5,2 9:7,8 2"
+    settings = next(line for line in lines if "load_config" in line).partition("None, ")[2].rstrip(")")
+    config = load_config(None, ast.literal_eval(settings))
+    (source,) = sources_of(given_options(config.metric))
+    assert isinstance(source, Distances)
+    assert [(str(each), each.meters) for each in source.distances] == [("3:1.5,2 4:100,20.5", 0.297)]
+    marked = command_and_python(
+        [*runs.command(name), "--marker", "aruco-4x4:0.1"], runs.folder, record.lengths
+    )
+    assert "metric.distance" not in marked  # the marker has determined the scale

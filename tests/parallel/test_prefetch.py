@@ -121,6 +121,18 @@ def test_prefetched_features_equal_those_computed_here(sequence: Sequence) -> No
 
 
 @pytest.mark.usefixtures("patient")
+def test_small_pictures_come_along_where_they_are_wanted(sequence: Sequence) -> None:
+    for is_wanted in (False, True):
+        sequence.sends_pictures = is_wanted
+        with ahead(sequence) as frames:
+            assert frames[0].picture is None  # read here
+            sent = frames[1].picture
+        assert (sent is not None) == is_wanted
+    assert sent is not None
+    assert torch.equal(sent, sequence.color(1))  # it is small already
+
+
+@pytest.mark.usefixtures("patient")
 def test_few_frames_are_requested_ahead() -> None:
     with ahead(open_sequence("synthetic:room?frames=50&blank=1")) as frames:
         assert frames[10].features is None

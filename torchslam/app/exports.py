@@ -87,8 +87,11 @@ def links(address: str) -> str:
     )
 
 
-def command_and_python(words: list[str], folder: Path) -> str:
-    """The command line of a run, and lines of Python that do the same; paths are relative to `folder`."""
+def command_and_python(words: list[str], folder: Path, lengths: Sequence[str] = ()) -> str:
+    """The command lines of a run, and lines of Python that do the same; paths are relative to `folder`.
+
+    The first of the `lengths` determines the scale where nothing else does; the others are compared with it.
+    """
     plain = [word.replace(f"{folder}/", "") for word in words]
     pairs = list(itertools.pairwise(plain))
     given = dict(pairs)
@@ -96,8 +99,12 @@ def command_and_python(words: list[str], folder: Path) -> str:
     for name in ("marker", "camera_height", "gps"):
         flag = "--" + name.replace("_", "-")
         settings += [f"metric.{name}={given[flag]}"] if flag in given else []
+    if lengths and not any(each.startswith("metric.") for each in settings):
+        settings.append(f"metric.distance={lengths[0]}")
+    commands = [plain, *(["align", given["--output"], "--distance", *each.split()] for each in lengths)]
+    shell = "\n".join(shlex.join(["torchslam", *each]) for each in commands)
     stride, camera, mapping = given.get("--stride", 1), given.get("--camera"), given.get("--mapping", "auto")
-    return f"""{shlex.join(["torchslam", *plain])}
+    return f"""{shell}
 
 import torchslam
 sequence = torchslam.open_sequence({plain[1]!r}, {camera!r}, stride={stride})

@@ -19,7 +19,7 @@ import threading
 import time
 import unicodedata
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from enum import StrEnum
 from pathlib import Path
 from typing import Any
@@ -59,11 +59,13 @@ class Record:
         title: the name of the uploaded file, only to be shown.
         source: what is run: a path below the folder of all runs, or `DEMO`.
         arguments: the other arguments of `torchslam run`.
+        lengths: by which its result was scaled then, each as `torchslam align --distance` takes it.
     """
 
     title: str
     source: str
     arguments: tuple[str, ...] = ()
+    lengths: tuple[str, ...] = ()
 
 
 class Runs:
@@ -98,9 +100,10 @@ class Runs:
     def state(self, name: str) -> State:
         """The state of a run, from its folder."""
         path = self.path(name)
+        is_queued = (path / QUEUE).exists()  # looked at first: it goes only once the lock is held
         if is_held(path):
             return State.RUNNING
-        if (path / QUEUE).exists():
+        if is_queued:
             return State.QUEUED
         if is_begun(path):
             return State.STOPPED
@@ -142,12 +145,16 @@ class Runs:
             paths = (self.folder / (stem + end) for end in ("", *(f"-{n}" for n in range(2, 100))))
             path = next(path for path in paths if not path.exists())
             path.mkdir()
-            if upload is not None:
-                upload.rename(path / upload.name)
-                source = f"{path.name}/{upload.name}"
-            for each in files:
-                shutil.copyfile(each, path / each.name)
-            write_record(path, Record(shown(title), source, arguments))
+            try:
+                for each in files:
+                    shutil.copyfile(each, path / each.name)
+                source = source if upload is None else f"{path.name}/{upload.name}"
+                write_record(path, Record(shown(title), source, arguments))
+                if upload is not None:
+                    upload.rename(path / upload.name)
+            except OSError:
+                shutil.rmtree(path)  # the upload is still where it was
+                raise
             (path / QUEUE).touch()
         return path.name
 
@@ -156,7 +163,14 @@ class Runs:
         with self._lock:
             if (state := self.state(name)) not in (State.STOPPED, State.FAILED):
                 raise ResultsError(f"{self.record(name).title} is {state}")
+            write_record(self.path(name), replace(self.record(name), lengths=()))  # it measures anew
             (self.path(name) / QUEUE).touch()
+
+    def scale(self, name: str, length: Sequence[str]) -> None:
+        """Bring a result into meters by two clicks and the meters between them. Raises ResultsError."""
+        path, record = self.path(name), self.record(name)
+        tool(["align", str(path), "--distance", *length])
+        write_record(path, replace(record, lengths=(*record.lengths, " ".join(length))))
 
     def stop(self, name: str) -> None:
         """End a run, which writes what it has; a queued one leaves the queue. Nothing for one that has ended."""
@@ -184,8 +198,10 @@ class Runs:
                 return
             if waiting and self.running() is None:
                 first = min(waiting, key=time_of)
-                first.unlink()
-                self._start(first.parent.name)
+                try:
+                    self._start(first.parent.name)
+                finally:
+                    first.unlink()
 
     def command(self, name: str) -> list[str]:
         """The words after `torchslam` of the command of a run, with absolute paths.
@@ -279,11 +295,11 @@ def read_record(path: Path) -> Record:
     """Read app.json; of results from elsewhere, and where it is damaged, the title names the folder."""
     try:
         content = parse_json(read_text(path / RECORD, JSON_BYTES, "a record"))
-        words = tuple(map(str, content["arguments"]))
-        return Record(str(content["title"]), str(content["source"]), words)
+        words, lengths = (tuple(map(str, content.get(each, ()))) for each in ("arguments", "lengths"))
+        return Record(str(content["title"]), str(content["source"]), words, lengths)
     except FileNotFoundError:
         return Record(shown(path.name), "")
-    except (OSError, ValueError, TypeError, KeyError):
+    except (OSError, ValueError, TypeError, KeyError, AttributeError):
         return Record(f"{shown(path.name)} (its {RECORD} is damaged)", "")
 
 

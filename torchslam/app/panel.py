@@ -51,6 +51,7 @@ class Panel:
         self._shown, self._is_live, self._frame = "", False, -1  # the run that is shown, and its frame
         self._upload: tuple[Path, str] | None = None
         self._rows = list[int]()  # points that were measured
+        self._told = ""  # the last error that no user caused
         self._viewer, self._flight = viewer, threading.Event()  # set: the path is not played
         self._flight.set()
         viewer.gui.configure_theme(control_width="large", show_logo=False, show_share_button=False)
@@ -87,6 +88,8 @@ class Panel:
             words = f"{called}: {about.get('frames', '?')} frames, {about.get('size', '')}. Start it below."
             self._source.content = line_of(words, "#2b8a3e")
         elif kind in FILE_KINDS:
+            if path.is_dir():
+                raise ResultsError(f"one {FILE_KINDS[kind]} is needed, not several files")
             self._options.take(kind, path.rename(path.with_name(f"{kind}{path.suffix}")))
         elif kind == "truth":
             self._compare(path, called, is_truth=True)
@@ -99,7 +102,7 @@ class Panel:
         self._source = self._gui.add_html(line_of("Drop a video, a zip of images or several photos, or:"))
         self._gui.add_html(file_button("Choose a video or photos", "recording", "#228be6;color:#fff"))
         self._recording = self._gui.add_dropdown("In the folder", (NONE, *self._runs.recordings()))
-        demo = self._button("Demo: a rendered room", lambda _: self._open(self._runs.add("demo room", DEMO)))
+        demo = self._button("Demo: a rendered room", lambda _: self.begin(self._runs.add("demo room", DEMO)))
         demo.color = "gray"
         self._options = Options(self._gui)
         self._button("Start", lambda _: self._start())
@@ -148,7 +151,12 @@ class Panel:
         else:
             raise ResultsError("choose a recording first")
         self._source.content = line_of("Drop the next recording on the page, or:")
-        self._open(name)
+        self.begin(name)
+
+    def begin(self, name: str) -> None:
+        """Show a run that was just added, unless one that goes on is shown, for which it waits."""
+        if not self._shown or self._runs.state(self._shown) is not State.RUNNING:
+            self._open(name)
 
     def _open(self, name: str) -> None:
         """Show a run: its map so far, or its result; nothing for an empty name."""
@@ -172,7 +180,8 @@ class Panel:
         self._timeline.image, self._timeline.visible = data["timeline"], True
         self._links.content = exports.links(f"/runs/{quote(name, safe='')}")
         if self._runs.record(name).source:
-            words = exports.command_and_python(self._runs.command(name), self._runs.folder)
+            lengths = self._runs.record(name).lengths
+            words = exports.command_and_python(self._runs.command(name), self._runs.folder, lengths)
             self._commands.content = f'<pre style="{PRE}">{html.escape(words)}</pre>'
         self._row.max = max(1, len(data["submap"].get("poses", ())) - 1)
 
@@ -247,8 +256,7 @@ class Panel:
         clicks = [click for row in self._rows if (click := click_of(self._scene.submap, row))]
         if len(clicks) != 2:
             raise ResultsError("no frame of the run shows both points: click other ones")
-        path, meters = str(self._runs.path(self._shown)), f"{self._meters.value:g}"
-        tool(["align", path, "--distance", *clicks, meters])
+        self._runs.scale(self._shown, [*clicks, f"{self._meters.value:g}"])
         self._open(self._shown)
 
     def _crop_scene(self) -> None:
@@ -284,52 +292,47 @@ class Panel:
 
     def _follow(self) -> None:
         """Show the map so far of the run that is shown; its result once it has ended."""
-        self._runs.advance()  # also if the images cannot be read
         if self._runs.state(self._shown) not in GOING_ON:
             self._open(self._shown)
             return
-        path, words = self._runs.path(self._shown), tuple(self._runs.command(self._shown)[1:])
-        try:
-            found = self._reader.call(reading.live, path, words, self._frame)
-        except (TorchslamError, OSError) as error:  # the run goes on
-            self._image.label, self._image.visible = f"not shown: {error}", True
-            return
-        if found is not None:
+        found = reading.live(self._runs.path(self._shown))
+        if found is not None and int(found["frame"]) != self._frame:
             self._frame = int(found["frame"])
             self._scene.show_live(found)
-            self._image.image, self._image.label, self._image.visible = found["image"], None, True
+            self._image.visible = found["image"].size > 0
+            self._image.image = found["image"] if self._image.visible else EMPTY
 
     def _refresh(self) -> None:
         """Start what waits, and update the status and the lists."""
         self._runs.advance()
-        names, rows = self._runs.names(), list[str]()
+        names, rows, others = self._runs.names(), list[str](), list[str]()
         for name in names:
             state, took = self._runs.state(name), self._runs.seconds(name)
+            if name != self._shown and state in GOING_ON:
+                others.append(f"{self._runs.record(name).title}: {state.value}")
             image = f'<img src="/runs/{quote(name, safe="")}/picture" alt="" style="{PICTURE}">'
             words = f"<b>{html.escape(self._runs.record(name).title)}</b><br>{html.escape(name)}<br>"
             words += state.value + (f", {took:.0f} s" if took else "")
             rows.append(f'<div style="{ROW}">{image if state is State.DONE else ""}<div>{words}</div></div>')
         self._list.content = "".join(rows) or line_of("No runs yet.")
-        others = [name for name in names if name != self._shown]
-        lists = ((self._chosen, names), (self._other, others), (self._recording, self._runs.recordings()))
+        comparable = [name for name in names if name != self._shown]
+        lists = ((self._chosen, names), (self._other, comparable), (self._recording, self._runs.recordings()))
         for each, values in lists:
             if each.options != (NONE, *values):
                 each.options = (NONE, *values)
         self._shown = self._shown if self._shown in names else ""
-        self._refresh_status()
+        self._refresh_status(others)
 
-    def _refresh_status(self) -> None:
-        """Update what is above the tabs: state, progress and messages of the run that is shown."""
+    def _refresh_status(self, others: list[str]) -> None:
+        """Update what is above the tabs: state, progress and messages of the run that is shown; and other runs."""
         state = self._runs.state(self._shown) if self._shown else None
         log = log_tail(self._runs.path(self._shown)) if self._shown else []
         words, share = progress_of(log) if state is State.RUNNING else ("", 0.0)
-        if state is State.QUEUED and (first := self._runs.running()):
-            words = f"waits for {self._runs.record(first).title}"
         messages = [line.removeprefix("torchslam: ") for line in log if line.startswith("torchslam: ")]
         has_ended = state in (State.STOPPED, State.FAILED)
         if has_ended and not (log and log[-1].startswith(("torchslam: error: ", INTERRUPTED))):
             messages.append(f"the run ended unexpectedly: {log[-1] if log else 'no message'}")
-        lines = [words, *(messages[-SHOWN_MESSAGES:] if state is not State.DONE else [])]
+        lines = [words, *(messages[-SHOWN_MESSAGES:] if state is not State.DONE else []), *others]
         content = "torchslam: from a video to a map"
         if state is not None:
             content = f"<b>{html.escape(self._runs.record(self._shown).title)}</b>: {state.value}"
@@ -352,16 +355,20 @@ class Panel:
         def guarded(event: Any) -> None:
             try:
                 with self._lock:
-                    action(event)
-                    self._refresh()
+                    try:
+                        action(event)
+                    finally:
+                        self._refresh()  # the status never stays that of before
             except Exception as error:  # the page goes on, whatever it is
                 if not isinstance(error, TorchslamError | OSError):
                     traceback.print_exc()
-                words = printable(without_paths(str(error), self._runs.folder))
-                if event is not None and event.client is not None:
-                    event.client.add_notification("That did not work", words, color="red")
-                else:
-                    self._status.content = line_of(words, "#c92a2a")
+                words = printable(without_paths(str(error) or type(error).__name__, self._runs.folder))
+                is_users = event is not None and event.client is not None
+                if not is_users and words == self._told:
+                    return  # the same every second
+                self._told = self._told if is_users else words
+                for client in [event.client] if is_users else self._viewer.get_clients().values():
+                    client.add_notification("That did not work", words, color="red")
 
         return guarded
 

@@ -1,38 +1,37 @@
 """Reads images and results in a process of its own: a damaged file can end that process, but not the server.
 
-The functions below run in that process, which alone imports torch; they return NumPy arrays.
+The functions below but `live` run in that process, which alone imports torch; they return NumPy arrays.
 """
 
 from __future__ import annotations
 
-import argparse
+import io
 import multiprocessing
 import os
 import threading
+import zipfile
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures import TimeoutError as TooLate
 from concurrent.futures.process import BrokenProcessPool
-from functools import lru_cache
-from importlib import import_module
 from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
 
 from torchslam.errors import ResultsError, TorchslamError
+from torchslam.io.file_names import LIVE
+from torchslam.utils.files import read_bytes
 
 Answer = TypeVar("Answer")
 NICENESS = 5
 """Of the process, relative to the server: a run that is watched comes first. With 10 it starved on a busy machine."""
 PATIENCE_S = 300.0
 """Seconds after which reading is given up. Tried at this value only."""
-LIVE_SIDE, THUMBNAIL_SIDE, MAX_THUMBNAILS = 480, 96, 24
-"""Longer sides of the image during a run and of those in the frusta, pixels; and number of the latter. An image
-takes .2 ms of a frame where there is no GPU."""
-MAX_KEPT = 600  # images that are kept to color the points of a run: up to 0.7 MB each
-MAX_PASSED = 4  # keyframes since the last look whose images are read as well
-UNSEEN = (150, 155, 165)  # red, green, blue of points without an image
+SIDE, THUMBNAIL_SIDE, MAX_THUMBNAILS = 960, 96, 24
+"""Longer sides of the image of a keyframe and of those in the frusta, pixels; and number of the latter. An image takes
+.2 ms of a frame where there is no GPU."""
+MAX_BYTES = 1 << 24  # of a live map: three times what its points, poses and picture take
 TIMELINE_INCHES = 5.0, 2.6  # width and height, of 100 pixels: about the width of the panel
 
 
@@ -61,9 +60,7 @@ class ReadingProcess:
         self._pool.shutdown(wait=False, cancel_futures=True)
 
     def _start(self) -> ProcessPoolExecutor:
-        pool = ProcessPoolExecutor(1, multiprocessing.get_context("spawn"), _begin)
-        pool.submit(import_module, "torchslam.cli.run")  # now rather than with the first image
-        return pool
+        return ProcessPoolExecutor(1, multiprocessing.get_context("spawn"), _begin)
 
 
 def _begin() -> None:
@@ -83,61 +80,20 @@ def _begin() -> None:
     cv2.setNumThreads(1)
 
 
-class _Watched:
-    """The images of a run that goes on, as they are shown, from its arguments after `run`."""
-
-    def __init__(self, words: tuple[str, ...]) -> None:
-        from torchslam.cli import arguments, run
-
-        parser = argparse.ArgumentParser()
-        run.add_arguments(parser)
-        self._sequence = arguments.sequence(parser.parse_args(words))
-        self._images = dict[int, np.ndarray]()
-
-    def image(self, frame: int) -> np.ndarray:
-        """The (H, W, 3) image of a frame, red, green, blue: not larger than it is shown."""
-        if frame not in self._images:
-            if len(self._images) >= MAX_KEPT:
-                del self._images[next(iter(self._images))]
-            self._images[frame] = small(self._sequence.color(frame).numpy(), LIVE_SIDE)
-        return self._images[frame]
-
-    def colors(self, frames: np.ndarray, pixels: np.ndarray, width: float) -> np.ndarray:
-        """The (N, 3) colors of image points in frames that were shown; `UNSEEN` for the others."""
-        colors = np.full((len(frames), 3), UNSEEN, np.uint8)
-        for frame in self._images.keys() & set(np.unique(frames).tolist()):
-            image, rows = self._images[frame], frames == frame
-            at = np.round(pixels[rows] * (image.shape[1] / width)).astype(int)
-            x, y = np.clip(at, 0, np.array(image.shape[1::-1]) - 1).T
-            colors[rows] = image[y, x]
-        return colors
-
-
-_watched = lru_cache(maxsize=1)(_Watched)
-
-
-def live(folder: Path, words: tuple[str, ...], shown: int) -> dict[str, Any] | None:
-    """The content of live.npz with the colors of the points and the image of the frame, its keypoints drawn.
-
-    None if its frame is that which is shown already, or there is no file.
-    """
-    from torchslam.io.viewer.frames import COLORS, draw_keypoints
-    from torchslam.io.viewer.live_map import read_live_map
-    from torchslam.types import State
-
-    found = read_live_map(folder)
-    if found is None or (frame := int(found["frame"])) == shown:
+def live(folder: Path) -> dict[str, Any] | None:
+    """Read what `LiveMap` writes, without torch; None if there is nothing yet. Raises ResultsError if it is damaged."""
+    path = folder / LIVE
+    try:
+        file = io.BytesIO(read_bytes(path, MAX_BYTES, "a live map"))
+        with zipfile.ZipFile(file) as archive:
+            if sum(entry.file_size for entry in archive.infolist()) > MAX_BYTES:
+                raise ValueError("it is packed")  # a run writes it unpacked
+        with np.load(file, allow_pickle=False) as content:
+            return {name: content[name] for name in content.files}
+    except FileNotFoundError:
         return None
-    watched, width = _watched(words), found["size"][0]
-    passed = [each for each in np.unique(found["seen_frame"]).tolist() if shown < each < frame]
-    for each in passed[:MAX_PASSED]:  # a decoder comes by them on its way
-        watched.image(each)
-    drawn = watched.image(frame).copy()
-    found["colors"] = watched.colors(found["seen_frame"], found["seen_pixel"], width)
-    scale, color = drawn.shape[1] / width, COLORS[State(str(found["state"]))][::-1]
-    draw_keypoints(drawn, found["keypoints"] * scale, UNSEEN, 1)
-    draw_keypoints(drawn, found["tracked"] * scale, color, 2)
-    return found | {"image": drawn}
+    except (OSError, ValueError, MemoryError, zipfile.BadZipFile) as error:
+        raise ResultsError(f"{path}: cannot be read: {error}") from None
 
 
 def result(folder: Path) -> dict[str, Any]:
@@ -152,10 +108,12 @@ def result(folder: Path) -> dict[str, Any]:
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
 
+    from torchslam.data.transforms import reduced
     from torchslam.io.plots import plot_tracking
     from torchslam.io.plots.charts import thin
     from torchslam.io.report import summary
     from torchslam.io.results import read_results
+    from torchslam.io.viewer.live_map import UNSEEN
     from torchslam.io.viewer.page import page_data
     from torchslam.types import State
 
@@ -171,7 +129,7 @@ def result(folder: Path) -> dict[str, Any]:
         try:
             opened = results.images(results.scene(results.main, keyframes_alone=True))
             for row in thin(len(submap["frames"]), MAX_THUMBNAILS).tolist():
-                images[row] = small(opened.bgr(int(submap["frames"][row]))[..., ::-1], THUMBNAIL_SIDE)
+                images[row] = reduced(opened.bgr(int(submap["frames"][row]))[..., ::-1], THUMBNAIL_SIDE)
         except (TorchslamError, OSError) as error:  # moved, or damaged
             rows["images"] = f"not shown: {error}"
         if not len(submap["colors"]):
@@ -189,6 +147,7 @@ def residuals(folder: Path, frame: int) -> tuple[np.ndarray, str]:
     """The image of a keyframe with its observations and ten times their residuals; and these in words."""
     import cv2
 
+    from torchslam.data.transforms import reduced
     from torchslam.geometry import transform
     from torchslam.io.results import open_run
     from torchslam.io.viewer.frames import draw_keypoints
@@ -203,7 +162,7 @@ def residuals(folder: Path, frame: int) -> tuple[np.ndarray, str]:
     observed = scene.pixels[seen].numpy()
     residual = scene.camera.project(points_c)[0].numpy() - observed
     image = run.images(scene).bgr(frame)[..., ::-1]
-    drawn = small(image, 2 * LIVE_SIDE)
+    drawn = reduced(image, SIDE)
     scale = drawn.shape[1] / image.shape[1]
     ends = np.round(scale * np.stack((observed, observed + 10 * residual), axis=1)).astype(int).tolist()
     for start, end in ends:
@@ -236,12 +195,3 @@ def compared(
     what, unit = ("ATE", "m") if is_truth else ("difference", "units of this result")
     words = f"{what} {found.ate_m:.4g} {unit} RMSE after Sim(3) alignment, over {len(found.errors_m)} frames"
     return transform(shown @ S, theirs.positions_w).float().numpy(), words
-
-
-def small(image: np.ndarray, side: int) -> np.ndarray:
-    """An image that is reduced to a longer side; a smaller one as it is."""
-    import cv2
-
-    scale = min(1.0, side / max(image.shape[:2]))
-    size = [max(1, round(scale * each)) for each in image.shape[1::-1]]
-    return np.ascontiguousarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA))

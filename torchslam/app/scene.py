@@ -53,7 +53,7 @@ class Scene:
             self._path("path", poses[:, :, 3], found["uncertain"], found["breaks"])
             corners = 0.08 * self._size * found["corners"]
             self._frusta(poses[-1:], corners)
-            self._images({0: found["image"]}, poses[-1:], corners)
+            self._images({0: found["image"]} if found["image"].size else {}, poses[-1:], corners)
         if not self._is_aimed:
             self._is_aimed = True
             self._scene.set_up_direction("-y")

@@ -35,6 +35,7 @@ from torchslam.cli.progress import ProgressBars, StopSignals
 from torchslam.config import Config, load_config
 from torchslam.data import Sequence
 from torchslam.data.calibration import CALIBRATION, check_replaceable, is_found
+from torchslam.data.readers.video import KIND
 from torchslam.data.sequence import Calibrated
 from torchslam.errors import ConfigError, ResultsError
 from torchslam.geometry import Camera
@@ -215,12 +216,14 @@ def run(sequence: Sequence, config: Config, options: argparse.Namespace) -> int:
         if options.camera_std is None:
             config = with_stated_std(config, sequence)
         slam, so_far = _begin(sequence, config, options)
+        # Others are read again for their pictures, which takes less time than a picture of each frame.
+        sequence.sends_pictures = options.live and sequence.kind == KIND
         sequence = source(sequence, config, slam.camera)
         (options.output / VIDEO).unlink(missing_ok=True)  # of an earlier run
         screens: list[FrameViewer] = [LiveView.spawn(slam)] if options.view else []
         screens += [film_of(sequence, options.output)] if options.video else []
         watching = viewers.enter_context(FrameViewers(slam, sequence, screens))
-        live = LiveMap(slam, options.output) if options.live else None
+        live = LiveMap(slam, sequence, options.output) if options.live else None
         checkpoints = Checkpoints(options.output, options.checkpoint, slam, so_far, sequence)
 
         def after_frame(result: StepResult, is_last: bool) -> None:

@@ -70,6 +70,8 @@ class Sequence(ABC):
         measurements: settings of the section `metric` that the dataset brings along, by name: files of its own sensors.
         as_stored: whether the orientation in the EXIF block of images is ignored, as the program did that calibrated.
         zoom: that is undone in the images; None: they are as they were taken.
+        sends_pictures: whether workers that read frames ahead send small pictures of them along. For a source that is
+            read in order alone, where reading a frame again takes long, and its color takes no time.
     """
 
     def __init__(
@@ -109,6 +111,7 @@ class Sequence(ABC):
         self.notes = tuple(map(printable, notes))
         self.as_stored = False
         self.zoom: Zoom | None = None
+        self.sends_pictures = False
         self.measurements: Mapping[str, str] = {}
         self.counted_until: float | None = None
         self.holder: object = None  # of what must not go before the sequence does: unpacked files
@@ -355,7 +358,7 @@ class Transformed(Sequence):
         )
         self.camera_std, self.as_stored = whole.camera_std, whole.as_stored
         self.counted_until, self.measurements = whole.counted_until, whole.measurements
-        self.zoom = whole.zoom
+        self.zoom, self.sends_pictures = whole.zoom, whole.sends_pictures
         self._whole = whole
         self._indices = indices
         self._same_pixels = camera is None and size in (None, whole.size)

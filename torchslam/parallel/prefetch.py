@@ -13,6 +13,7 @@ from dataclasses import replace
 import torch
 
 from torchslam.data.sequence import EndOfSequence, Sequence
+from torchslam.data.transforms import reduced
 from torchslam.errors import FrameError
 from torchslam.parallel.pool import Call, WorkerPool
 from torchslam.types import Features, Frame
@@ -105,6 +106,9 @@ def _frame_reader(sequence: Sequence, make_extractor: Callable[[], Extractor]) -
 
     def read(index: int) -> Frame:
         frame = sequence[index]
-        return replace(frame, image=no_image, mask=None, features=extract(frame))
+        picture = (
+            torch.from_numpy(reduced(sequence.color(index).numpy())) if sequence.sends_pictures else None
+        )
+        return replace(frame, image=no_image, mask=None, features=extract(frame), picture=picture)
 
     return read

@@ -147,6 +147,7 @@ class SLAM:
         self.session, self.atlas, self.mapping = session, session.atlas, session.mapping
         self.last_frame = last_frame
         self.last_features: FrameFeatures | None = None  # of the last frame, before masking
+        self.last_picture: torch.Tensor | None = None  # of the last frame, if it brought one
         self.tracker = self.tracker.for_session(session.mapping)
         self.mapper.adjustment.drop()
         self.loop_closer = LoopCloser(self.shared_camera, self.config, self.atlas, self.matcher)
@@ -336,6 +337,7 @@ class SLAM:
             features = self.extractor(frame)
         view = prepare_view(FrameFeatures.of(frame, features, self.camera.params), frame, self.matcher)
         self.last_features = view = replace(view, session=self.session.number)
+        self.last_picture = frame.picture
         if self.last_frame is None:
             self._check_feature_kind(view)
         self.last_frame = frame.index, frame.timestamp

@@ -12,6 +12,7 @@ import torch
 
 from torchslam.data import Calibrated, open_sequence
 from torchslam.data.calibration import write_calibration
+from torchslam.data.readers.video import VideoSequence
 from torchslam.errors import CalibrationError, FrameError, SequenceError
 from torchslam.geometry import Camera
 
@@ -102,6 +103,16 @@ def test_video_in_order_and_back(video: Path) -> None:
         assert float(frame.image.mean()) == pytest.approx(30 * index / 255, abs=0.01)
     assert torch.equal(open_sequence(video, CAMERA, stride=3)[1].image, sequence[3].image)
     assert open_sequence(video, CAMERA, fps=12.5).frame_rate == pytest.approx(12.5)
+
+
+def test_the_color_of_the_last_frame_of_a_video_is_at_hand(
+    video: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    sequence = open_sequence(video, "fov=60")
+    expected = sequence.color(3)
+    monkeypatch.setattr(VideoSequence, "_rewind", lambda _: pytest.fail("the decoder goes back"))
+    sequence.image(5)
+    assert not torch.equal(sequence.color(5), expected)
 
 
 def test_unreadable_video(tmp_path: Path) -> None:

@@ -37,6 +37,7 @@ from torchslam.utils.forks import forget_in_forks, never_release
 SUFFIXES = frozenset(
     {".mp4", ".avi", ".mov", ".mkv", ".webm", ".m4v", ".mpg", ".mpeg", ".ts", ".mts", ".3gp", ".wmv"}
 )
+KIND = "video"  # of these sequences
 MP4 = (".mp4", ".mov", ".m4v", ".3gp")
 MAX_FRAMES = 2_000_000  # maximum number of frames: 18 hours at 30 frames per second
 QUIET = 2.0  # seconds of decoding before a progress bar appears
@@ -169,6 +170,7 @@ class VideoSequence(Sequence):
     def __init__(self, path: Path, camera: GivenCamera | None, need: Need = exhaust) -> None:
         """Raises SequenceError for a file that holds no video, CalibrationError for a camera that does not fit."""
         self._path = path
+        self._last: tuple[int, np.ndarray] | None = None
         _check(path)
         self._rewind()
         width, height = (
@@ -199,7 +201,7 @@ class VideoSequence(Sequence):
         aspect = pixel_aspect(self._capture, str(path))
         super().__init__(
             path.stem,
-            "video",
+            KIND,
             camera,
             float64([times[frame] for frame in self._frames]),
             size=size,
@@ -215,7 +217,7 @@ class VideoSequence(Sequence):
             self.notes = (*self.notes, contradiction)
 
     def __getstate__(self) -> dict[str, Any]:
-        return super().__getstate__() | {"_capture": None, "_retriever": None}
+        return super().__getstate__() | {"_capture": None, "_retriever": None, "_last": None}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__dict__.update(state)
@@ -281,11 +283,14 @@ class VideoSequence(Sequence):
             raise error(f"{where}: {cause}") from cause
 
     def _frame(self, index: int) -> np.ndarray:
-        frame = self._read(self._frames[index], self.image_name(index))
-        if frame is None:
-            raise FrameError(f"{self.image_name(index)}: cannot be decoded")
-        self._check_size(frame.shape, self.image_name(index))
-        return frame
+        """The frame, which is kept: its color after its gray image would take the decoder back to the beginning."""
+        if self._last is None or self._last[0] != index:
+            frame = self._read(self._frames[index], self.image_name(index))
+            if frame is None:
+                raise FrameError(f"{self.image_name(index)}: cannot be decoded")
+            self._check_size(frame.shape, self.image_name(index))
+            self._last = index, frame
+        return self._last[1]
 
     def _read(self, frame: int, where: str) -> np.ndarray | None:
         """The (H, W, 3) uint8 frame, blue first; those in between are skipped without conversion. Raises FrameError."""

@@ -65,13 +65,22 @@ def _draw_shapes(rng: np.random.Generator, image: np.ndarray, count: int, extent
     letters = rng.integers(ord("A"), ord("Z") + 1, count)
     corners = rng.integers(3, 7, count)
     jitters = rng.uniform(-0.35, 0.35, (count, 6))
-    for i in range(count):
-        x, y = centers[i]
+    # The outlines of polygons and bars, all at once: (count, 6, 2), of which the first `sides` are corners.
+    is_bar = kinds == KINDS.index("bar")
+    sides = np.where(is_bar, 4, corners)
+    angles = 2 * np.pi * (np.arange(6) + np.where(is_bar[:, None], 0, jitters)) / sides[:, None]
+    outlines = np.stack((np.cos(angles), np.sin(angles) * aspects[:, None]), axis=-1) * radii[:, None, None]
+    cosine, sine = np.cos(turns), np.sin(turns)
+    rotations = np.stack((np.stack((cosine, sine), axis=-1), np.stack((-sine, cosine), axis=-1)), axis=-2)
+    fixed = ((outlines @ rotations + centers[:, None]) * 2**FRACTION_BITS).round().astype(np.int32)
+    for i, ((x, y), contrast, radius) in enumerate(
+        zip(centers.tolist(), contrasts.tolist(), radii.tolist(), strict=True)
+    ):
         below = int(image[int(y), int(x)])
-        gray = int(np.clip(below + contrasts[i], 0, 255))
+        gray = int(min(max(below + contrast, 0), 255))
         if abs(gray - below) < MIN_CONTRAST:  # the other way, since this one is cut off
-            gray = int(np.clip(below - contrasts[i], 0, 255))
-        kind, radius = KINDS[kinds[i]], radii[i]
+            gray = int(min(max(below - contrast, 0), 255))
+        kind = KINDS[kinds[i]]
         if kind == "letter":
             corner, font = (int(x - 0.6 * radius), int(y + 0.7 * radius)), cv2.FONT_HERSHEY_SIMPLEX
             thickness = max(1, round(radius / 4))
@@ -80,13 +89,7 @@ def _draw_shapes(rng: np.random.Generator, image: np.ndarray, count: int, extent
             axes = (max(1.0, 2 * radius), max(1.0, 2 * radius * aspects[i]))
             cv2.ellipse(image, ((x, y), axes, math.degrees(turns[i])), gray, -1, cv2.LINE_AA)
         else:
-            sides = 4 if kind == "bar" else corners[i]
-            angles = 2 * np.pi * (np.arange(sides) + (0 if kind == "bar" else jitters[i, :sides])) / sides
-            outline = np.stack((np.cos(angles), np.sin(angles) * aspects[i]), axis=-1) * radius
-            cosine, sine = math.cos(turns[i]), math.sin(turns[i])
-            points = outline @ np.array(((cosine, sine), (-sine, cosine))) + (x, y)
-            fixed = (points * 2**FRACTION_BITS).round().astype(np.int32)
-            cv2.fillPoly(image, [fixed], gray, cv2.LINE_AA, FRACTION_BITS)
+            cv2.fillPoly(image, [fixed[i, : sides[i]]], gray, cv2.LINE_AA, FRACTION_BITS)
 
 
 Vector = tuple[float, float, float]

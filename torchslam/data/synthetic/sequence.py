@@ -168,6 +168,7 @@ class SyntheticSequence(Sequence):
         camera = Camera.pinhole(FOCAL, FOCAL, *center, size=SIZE)
         super().__init__(scene, "rendered", camera, timestamps, Trajectory(timestamps, T_wc))
         self._options = options
+        self._last: tuple[int, np.ndarray] | None = None
 
     def image(self, index: int) -> Float[Tensor, "1 1 H W"]:
         options = self._options
@@ -190,6 +191,12 @@ class SyntheticSequence(Sequence):
         return downloads().parent / "rendered" / name
 
     def _rendered(self, index: int) -> UInt8[np.ndarray, "H W"]:
+        """The image, which is kept: it is read again to be shown."""
+        if self._last is None or self._last[0] != index:
+            self._last = index, self._render(index)
+        return self._last[1]
+
+    def _render(self, index: int) -> UInt8[np.ndarray, "H W"]:
         options = self._options
         image = _renderer(self._scene.build, options.seed).render(self._row_poses(index))
         if options.blur > 0:

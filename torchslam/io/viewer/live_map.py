@@ -1,25 +1,26 @@
-"""live.npz: the map and the path of a run that is going on, for a program that watches it (`torchslam app`)."""
+"""live.npz: what a run that goes on looks like, for a program that watches it (`torchslam app`)."""
 
 from __future__ import annotations
 
 import io
 import time
-import zipfile
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 
-from torchslam.errors import ResultsError
+from torchslam.data.sequence import Sequence
+from torchslam.data.transforms import reduced
+from torchslam.errors import FrameError
 from torchslam.io.export.recording import gaps
 from torchslam.io.file_names import LIVE
 from torchslam.io.plots.charts import thin
-from torchslam.io.viewer.frames import tracked_pixels
+from torchslam.io.viewer.frames import COLORS, draw_keypoints, tracked_pixels
 from torchslam.io.viewer.page import MAX_POINTS, clearest_observations, image_corners
 from torchslam.system.slam import SLAM
 from torchslam.types import State, StepResult
-from torchslam.utils.files import PART, read_bytes
+from torchslam.utils.files import PART
 
 EVERY_S = 0.5
 """Shortest time between two files, seconds. Tried at 0.5 only: a person sees the map grow."""
@@ -28,15 +29,19 @@ SHARE = 0.02
 PATIENCE_S = 2.0
 """Seconds after which a frame that is no keyframe is shown as well. Tried at 2 only."""
 MAX_PATH = 5_000  # poses of the path in the file: 100 bytes each
-MAX_BYTES = 1 << 24  # of the file: three times what `MAX_POINTS` and `MAX_PATH` take
+MAX_KEPT, KEPT_SIDE = 600, 240
+"""Keyframes whose pictures are kept to color the points, at least five minutes; and the longer side of these, which
+take 0.13 MB each. Tried at these values only."""
+UNSEEN = (150, 155, 165)  # red, green, blue of points without a picture
 
 
 class LiveMap:
     """Writes the file after keyframes, at most every `EVERY_S`, without waiting for the disk."""
 
-    def __init__(self, slam: SLAM, folder: Path) -> None:
-        self._slam, self._path = slam, folder / LIVE
-        self._next, self._next_cpu, self._shown = 0.0, 0.0, list[int]()  # seconds of both clocks
+    def __init__(self, slam: SLAM, sequence: Sequence, folder: Path) -> None:
+        self._slam, self._sequence, self._path = slam, sequence, folder / LIVE
+        self._next, self._next_cpu = 0.0, 0.0  # seconds of both clocks
+        self._kept = dict[int, np.ndarray]()  # pictures of keyframes, by frame
         self._uncertain = list[float]()
 
     def offer(self, result: StepResult) -> None:
@@ -47,8 +52,6 @@ class LiveMap:
         patience = 0.0 if result.is_keyframe else PATIENCE_S
         if time.monotonic() < self._next + patience or start < self._next_cpu:
             return
-        if result.is_keyframe:
-            self._shown.append(result.index)
         content = io.BytesIO()
         np.savez(content, **self._arrays(result))
         part = self._path.with_name(self._path.name + PART)
@@ -61,27 +64,19 @@ class LiveMap:
         """The content of the file.
 
         Returns:
-            frame, state, keyframe: of the last frame
-            size, corners: (2,) width and height; (4, 3) rays through the corners of the image
-            keypoints, tracked: (N, 2), (M, 2) pixels of the last frame, as of `FrameSnapshot`
-            points: (P, 3) in the world of the map
-            seen_frame, seen_pixel: (P,), (P, 2) a frame that was shown before with the point, -1 without one; pixels
+            frame: index of the last one
+            image: its (H, W, 3) picture, red, green, blue, with its keypoints; (0, 0, 3) if it cannot be read again
+            corners: (4, 3) rays through the corners of the image
+            points, colors: (P, 3), (P, 3) in the world of the map; red, green, blue
             poses: (F, 3, 4) camera to world, in order of time
             uncertain: (F,) whether the pose was uncertain when it was found
             breaks: rows before which the path is interrupted
         """
         slam = self._slam
-        session, slam_map, seen = slam.session.number, slam.map, slam.last_features
-        empty = torch.zeros(0, 2, dtype=torch.float32, device="cpu")
-        arrays: dict[str, Any] = {
-            "frame": result.index,
-            "state": result.state.value,
-            "keyframe": result.is_keyframe,
-            "size": np.array(slam.camera.size),
-            "corners": image_corners(slam.camera.to("cpu")),
-            "keypoints": empty if seen is None else seen.keypoints[seen.mask].float().cpu(),
-            "tracked": tracked_pixels(slam, result.index).float().cpu(),
-        }
+        session, slam_map = slam.session.number, slam.map
+        image = self._image(result)
+        corners = image_corners(slam.camera.to("cpu"))
+        arrays: dict[str, Any] = {"frame": result.index, "image": image, "corners": corners}
         path = slam.posed_frames.trajectory(slam_map, session)
         rows = thin(len(path), MAX_PATH)
         times = path.timestamps[rows]
@@ -90,34 +85,46 @@ class LiveMap:
             "uncertain": np.isin(times.numpy(), self._uncertain),
             "breaks": np.array(gaps(times), dtype=np.int64),
         }
-        points = torch.zeros(0, 3, dtype=torch.float32, device="cpu")
-        frames, pixels = torch.zeros(0, dtype=torch.int64, device="cpu"), empty
+        arrays |= {"points": np.zeros((0, 3), np.float32), "colors": np.zeros((0, 3), np.uint8)}
         if slam_map.num_points:
             ids = slam_map.valid_points()
             ids = ids[thin(len(ids), MAX_POINTS)]
             keyframes = slam_map.keyframe_rows(session)
-            was_shown = torch.isin(
+            was_kept = torch.isin(
                 slam_map.keyframes["frame_index"][keyframes],
-                torch.tensor(self._shown, device=keyframes.device),
+                torch.tensor(list(self._kept), dtype=torch.int64, device=keyframes.device),
             )
-            size = slam.camera.size
-            frames, pixels = clearest_observations(slam_map, ids, keyframes[was_shown], size)
-            points = slam_map.positions_w[ids].float()
-        arrays |= {"points": points.cpu(), "seen_frame": frames.cpu(), "seen_pixel": pixels.float().cpu()}
+            seen = clearest_observations(slam_map, ids, keyframes[was_kept], slam.camera.size)
+            arrays["colors"] = self._colors(*(each.cpu().numpy() for each in seen))
+            arrays["points"] = slam_map.positions_w[ids].float().cpu()
         return {name: np.asarray(value) for name, value in arrays.items()}
 
+    def _image(self, result: StepResult) -> np.ndarray:
+        """The picture of the last frame with its keypoints; that of a keyframe is kept to color its points."""
+        slam, seen = self._slam, self._slam.last_features
+        try:
+            sequence = self._sequence.unzoomed(slam.zoom)
+            sent = slam.last_picture
+            image = reduced(sequence.color(result.index).numpy()) if sent is None else sent.numpy().copy()
+        except FrameError:  # only gray, as of a live source; the run goes on, and the page shows no picture
+            return np.zeros((0, 0, 3), np.uint8)
+        if result.is_keyframe:
+            if len(self._kept) >= MAX_KEPT:
+                del self._kept[next(iter(self._kept))]
+            self._kept[result.index] = reduced(image, KEPT_SIDE)
+        scale = image.shape[1] / slam.camera.width
+        if seen is not None:
+            draw_keypoints(image, seen.keypoints[seen.mask].cpu().numpy() * scale, UNSEEN, 1)
+        tracked = tracked_pixels(slam, result.index).cpu().numpy()
+        draw_keypoints(image, tracked * scale, COLORS[result.state][::-1], 2)
+        return image
 
-def read_live_map(folder: Path) -> dict[str, Any] | None:
-    """Read the file of a results folder; None if there is none. Raises ResultsError if it is damaged."""
-    path = folder / LIVE
-    try:
-        file = io.BytesIO(read_bytes(path, MAX_BYTES, "a live map"))
-        with zipfile.ZipFile(file) as archive:
-            if sum(entry.file_size for entry in archive.infolist()) > MAX_BYTES:
-                raise ValueError("it is packed")  # a run writes it unpacked
-        with np.load(file, allow_pickle=False) as content:
-            return {name: content[name] for name in content.files}
-    except FileNotFoundError:
-        return None
-    except (OSError, ValueError, zipfile.BadZipFile) as error:
-        raise ResultsError(f"{path}: cannot be read: {error}") from None
+    def _colors(self, frames: np.ndarray, pixels: np.ndarray) -> np.ndarray:
+        """The (N, 3) colors of image points in frames whose pictures are kept; `UNSEEN` for the others."""
+        colors = np.full((len(frames), 3), UNSEEN, np.uint8)
+        for frame in self._kept.keys() & set(np.unique(frames).tolist()):
+            image, rows = self._kept[frame], frames == frame
+            at = np.round(pixels[rows] * (image.shape[1] / self._slam.camera.width)).astype(int)
+            x, y = np.clip(at, 0, np.array(image.shape[1::-1]) - 1).T
+            colors[rows] = image[y, x]
+        return colors
