@@ -457,7 +457,8 @@ class BundleMinimization(Minimization):
         directions = self._directions(given.params)
         if isinstance(layout, DenseLayout):
             return DenseBundle(layout, dense_data(layout, given), self.camera, kernel, directions)
-        return SparseBundle(layout, given.part(0), self.camera, kernel, directions, self.kinds)
+        newton = self.options.backward == "implicit"
+        return SparseBundle(layout, given.part(0), self.camera, kernel, directions, self.kinds, newton)
 
     def _laid_out(self, given: BundleData) -> tuple[MovingParts, list[BatchPart]]:
         """The layouts for the observations that count; the last ones are kept, which mostly are the next ones."""
