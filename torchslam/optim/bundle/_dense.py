@@ -252,6 +252,7 @@ class DenseBundle:
     camera: Camera
     kernel: Kernel
     directions: Float[Tensor, "P n"] | None
+    concludes: bool = False
 
     @property
     def solvable(self) -> Tensor:
@@ -292,6 +293,9 @@ class DenseBundle:
         return BundleEstimate(T_cw, points_w - points, params), predicted_reduction
 
     select = staticmethod(select_models)
+
+    def concluded(self, model: DenseModel, estimate: BundleEstimate) -> DenseModel:
+        return model._replace(estimate=estimate)
 
     def definite(self, model: DenseModel) -> Tensor:
         """Whether (B,) all that moves is determined, up to the gauge."""

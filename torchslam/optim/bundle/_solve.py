@@ -455,10 +455,13 @@ class BundleMinimization(Minimization):
     def _bundle(self, given: BundleData, part: BatchPart) -> Any:
         given, layout, kernel = given.part(part.rows), part.layout, self.options.kernel
         directions = self._directions(given.params)
+        passes_gradient = self.options.backward == "implicit"
         if isinstance(layout, DenseLayout):
-            return DenseBundle(layout, dense_data(layout, given), self.camera, kernel, directions)
-        newton = self.options.backward == "implicit"
-        return SparseBundle(layout, given.part(0), self.camera, kernel, directions, self.kinds, newton)
+            data = dense_data(layout, given)
+            return DenseBundle(layout, data, self.camera, kernel, directions, passes_gradient)
+        return SparseBundle(
+            layout, given.part(0), self.camera, kernel, directions, self.kinds, passes_gradient
+        )
 
     def _laid_out(self, given: BundleData) -> tuple[MovingParts, list[BatchPart]]:
         """The layouts for the observations that count; the last ones are kept, which mostly are the next ones."""

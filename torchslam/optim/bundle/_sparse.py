@@ -495,6 +495,13 @@ class SparseBundle:
 
     select = staticmethod(select_models)
 
+    @property
+    def concludes(self) -> bool:
+        return self.has_newton
+
+    def concluded(self, model: SparseModel, estimate: BundleEstimate) -> SparseModel:
+        return replace(model, estimate=estimate, assembled=lambda: model.equations)
+
     def definite(self, model: SparseModel) -> Tensor:
         """Whether (1,) all that moves is determined, up to the gauge."""
         if self._has_drifted:
