@@ -17,7 +17,7 @@ from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass, field, replace
 from enum import Enum
-from typing import Any, Protocol, Self, TypeVar, get_args, runtime_checkable
+from typing import Any, Protocol, Self, TypeVar, get_args
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -76,7 +76,6 @@ class LeastSquares(Protocol[X, M]):
         ...
 
 
-@runtime_checkable
 class Divisible(Protocol):
     """A problem whose models are named tuples of batched tensors: elements that have converged leave the batch."""
 
@@ -85,7 +84,6 @@ class Divisible(Protocol):
         ...
 
 
-@runtime_checkable
 class Rounded(Protocol):
     """A problem with known rounding errors: a cost below them cannot be reduced."""
 
@@ -94,7 +92,6 @@ class Rounded(Protocol):
         ...
 
 
-@runtime_checkable
 class Drifting(Protocol):
     """A problem that may have no minimum because its unknowns drift to a limit where it is degenerate."""
 
@@ -103,7 +100,6 @@ class Drifting(Protocol):
         ...
 
 
-@runtime_checkable
 class Concluding(Protocol):
     """A problem whose last step is taken without an evaluation, which is a fifth of a short search."""
 
@@ -298,13 +294,16 @@ def minimize_batch(
     rounding = torch.finfo(initial_cost.dtype).eps
     slack = 1 + 100 * rounding
     vanished = rounding**1.5 * initial_cost
-    if isinstance(problem, Rounded):
+    if hasattr(problem, "rounding"):  # as `Rounded`; to ask for a protocol takes .1 ms
         vanished = torch.maximum(vanished, problem.rounding())
     damping = torch.full_like(initial_cost, INITIAL_DAMPING)
     steps, given_up = torch.zeros_like(active, dtype=torch.int64), torch.zeros_like(active)
     rows, finished = torch.arange(len(active), device=active.device), []
-    drifting, divisible = isinstance(problem, Drifting), isinstance(problem, Divisible)  # .1 ms each
-    concludes = isinstance(problem, Concluding) and problem.concludes
+    drifting, divisible, concludes = (
+        hasattr(problem, "drifts"),
+        hasattr(problem, "part"),
+        getattr(problem, "concludes", False),
+    )
     for iteration in range(iterations):
         if progress is not None:
             progress(iteration, iterations)
