@@ -438,7 +438,7 @@ def solve_graph(
         """The minimum of a graph whose keypoints are those of a global shutter."""
 
         def adjust(submaps: Sequence[_GraphSubmap]) -> list[BundleSolution]:
-            solve = partial(solve_bundle, options=options, progress=progress)
+            solve = partial(solve_bundle, options=options, progress=progress, near=start is not None)
             main = max(range(len(submaps)), key=lambda row: len(submaps[row].keyframes))
             problems = [_with_factors(submap, graph, factors, depth_prior) for submap in submaps]
             first = solve(replace(problems[main], camera_prior=prior), free_camera=free)

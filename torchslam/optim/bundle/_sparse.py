@@ -269,9 +269,11 @@ class SparseBundle:
         directions: Tensor | None,
         kinds: Sequence[FactorKind],
         newton: bool = False,
+        concludes: bool = False,
     ) -> None:
         """given: of one problem; directions: (P, n) in which the parameters move, None where they stay; kinds: of
-        factors; newton: whether to end with steps of Newton"""
+        factors; newton: whether to end with steps of Newton; concludes: as of `Concluding`"""
+        self.concludes = concludes
         self.kinds = [kind._replace(points=layout.point_rank[kind.points]) for kind in kinds]
         self.drift_steps = 0  # in a row
         self.layout, self.given, self.directions = layout, given, directions
@@ -494,10 +496,6 @@ class SparseBundle:
         return self.drift_steps >= _DRIFT_STEPS
 
     select = staticmethod(select_models)
-
-    @property
-    def concludes(self) -> bool:
-        return self.has_newton
 
     def concluded(self, model: SparseModel, estimate: BundleEstimate) -> SparseModel:
         return replace(model, estimate=estimate, assembled=lambda: model.equations)
