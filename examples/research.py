@@ -27,7 +27,7 @@ from torchslam.evaluation import ate
 from torchslam.geometry import se3_inverse
 from torchslam.learning import Training
 from torchslam.optim import GRAPH_OPTIONS, Factors
-from torchslam.optim.run_graph import RunGraph
+from torchslam.optim.observation_graph import RunGraph
 
 TRAIN, TEST = (1, 2, 3), (101, 102)  # seeds of the rooms
 OPTIONS = "noise=3&blur=0.7"

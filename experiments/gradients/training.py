@@ -95,8 +95,8 @@ def main() -> None:
         for graph in graphs
     )
     text = (
-        f"Three graphs of {len(graphs[0].T_cw)} frames ({sizes}). CPU seconds of one thread, medians; a step solves and "
-        "differentiates all three.\n\n    python -m experiments.gradients.training\n\n"
+        f"Three graphs of {len(graphs[0].T_cw)} frames ({sizes}). CPU seconds of one thread, medians; a step "
+        "solves and differentiates all three.\n\n    python -m experiments.gradients.training\n\n"
     )
     publish_page("A step of training", text + found, arguments)
     if not arguments.no_page:

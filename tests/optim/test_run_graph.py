@@ -15,13 +15,8 @@ from torchslam.geometry.camera_measurement import CameraMeasurement
 from torchslam.optim import GRAPH_OPTIONS, DepthPrior, Factors, log_distance_error
 from torchslam.optim._core.levenberg_marquardt import SolverReason
 from torchslam.optim.gradient_check import check_gradient
-from torchslam.optim.run_graph import (
-    ObservationGraph,
-    RunGraph,
-    concatenate_graphs,
-    solve_graph,
-    solve_graphs,
-)
+from torchslam.optim.observation_graph import ObservationGraph, RunGraph, concatenate_graphs
+from torchslam.optim.run_graph import solve_graph, solve_graphs
 from torchslam.utils.memory import available_memory
 
 CONVERGED = {"iterations": 25, "tolerance": 0.0}

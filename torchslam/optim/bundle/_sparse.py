@@ -671,7 +671,7 @@ class SparseBundle:
 
         return solve
 
-    def _seen(self, estimate: BundleEstimate, run: slice = _ALL) -> Seen:
+    def _seen(self, estimate: BundleEstimate, run: slice | Tensor = _ALL) -> Seen:
         R_cw = estimate.T_cw[:, :3, :3]
         centers_w = -(R_cw.mT @ estimate.T_cw[:, :3, 3:])
         frames = torch.cat((R_cw.flatten(1), centers_w[..., 0]), dim=-1)
@@ -691,7 +691,7 @@ class SparseBundle:
             return points
         return torch.cat((points, self.directions.mT @ rows[:, 3:]), dim=1)
 
-    def _observed(self, params: Tensor, run: slice) -> ReprojectionData:
+    def _observed(self, params: Tensor, run: slice | Tensor) -> ReprojectionData:
         camera = self.camera.with_params(params)
         camera = camera[0] if self.camera_of is None else camera[self.camera_of[run]]
         return ReprojectionData(self.pixels[run], self.weights[run], camera, self.kernel, self.given.scale)
@@ -766,7 +766,7 @@ class SparseBundle:
         return assemble_sparse(layout.structure, expansion, rays_w, layout.free_points, exact)
 
     def _depth_terms(
-        self, seen: Seen, run: slice, share: Tensor | float = 1.0, exact: bool = False
+        self, seen: Seen, run: slice | Tensor, share: Tensor | float = 1.0, exact: bool = False
     ) -> DepthTerms:
         assert self.depths is not None
         depths, information = self.depths
