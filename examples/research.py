@@ -27,7 +27,7 @@ from torchslam.evaluation import ate
 from torchslam.geometry import se3_inverse
 from torchslam.learning import Training
 from torchslam.optim import GRAPH_OPTIONS, Factors
-from torchslam.optim.run_graph import RunGraph
+from torchslam.optim.observation_graph import RunGraph
 
 TRAIN, TEST = (1, 2, 3), (101, 102)  # seeds of the rooms
 OPTIONS = "noise=3&blur=0.7"
@@ -81,13 +81,20 @@ class Corrections(nn.Module):
         weights = graph.weights * (logs - logs.mean()).exp()  # of geometric mean 1: only ratios are learned
         return replace(graph, pixels=graph.pixels + self.move(places), weights=weights)
 
-    def solve(self, example: Example, precise: bool = False) -> GraphSolution:
-        """All poses of a room."""
+    def solve(
+        self,
+        example: Example,
+        precise: bool = False,
+        start: GraphSolution | None = None,
+        has_factor: bool = True,
+    ) -> GraphSolution:
+        """All poses of a room; start: the solution of a step before, from which few iterations are left."""
         count = len(example.pairs)
         information = torch.full((count, 1, 1), 1 / WHEEL_STD**2, dtype=torch.float64)
         factor = Factors(example.pairs, example.distances, information, self.wheels)
+        factors = [factor] if has_factor else []
         options = PRECISE if precise else GRAPH_OPTIONS
-        return solve_graph(self(example), factors=[factor], options=options)
+        return solve_graph(self(example), factors=factors, options=options, start=start)
 
 
 def error(module: Corrections, example: Example, precise: bool = False) -> Tensor:
@@ -198,8 +205,11 @@ def main(arguments: list[str] | None = None) -> None:
 
     if not curve:
         measure()
+    last: dict[int, GraphSolution] = {}  # of each room, from which its next search starts
     for step in training:
-        training.descend(error(module, train[step % len(train)]).log())
+        row = step % len(train)
+        last[row] = module.solve(train[row], start=last.get(row))
+        training.descend(ate(T_cw=last[row].T_cw, T_cw_groundtruth=train[row].T_cw).log())
         if training.step % EVERY == 0 or training.step == options.steps:
             measure()
             training.save(checkpoint)

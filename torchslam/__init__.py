@@ -38,7 +38,8 @@ if TYPE_CHECKING:
     )
     from torchslam.learning.clip_slam import ClipGraph, ClipPoses, ClipSLAM, clip_loss
     from torchslam.optim import BundleProblem, SolverOptions, solve_bundle, solve_least_squares, solve_pose
-    from torchslam.optim.run_graph import GraphSolution, ObservationGraph, solve_graph
+    from torchslam.optim.observation_graph import ObservationGraph
+    from torchslam.optim.run_graph import GraphSolution, solve_graph
     from torchslam.recording import run
     from torchslam.system.run import Run
     from torchslam.system.slam import SLAM
@@ -100,7 +101,8 @@ _HOMES = {
     "torchslam.system.run": "Run",
     "torchslam.system.slam": "SLAM",
     "torchslam.optim": "BundleProblem SolverOptions solve_bundle solve_least_squares solve_pose",
-    "torchslam.optim.run_graph": "GraphSolution ObservationGraph solve_graph",
+    "torchslam.optim.observation_graph": "ObservationGraph",
+    "torchslam.optim.run_graph": "GraphSolution solve_graph",
     "torchslam.types": "Features Frame Matches State StepResult Trajectory",
 }
 """Public names by the module that has them, and public packages and modules."""

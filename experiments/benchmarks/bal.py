@@ -28,7 +28,7 @@ from torchslam.config import load_config
 from torchslam.data import open_sequence
 from torchslam.geometry import Camera, rigid, se3_exp, so3_exp, so3_log, transform
 from torchslam.optim import BUNDLE_OPTIONS, BundleProblem, solve_bundle
-from torchslam.optim.run_graph import ObservationGraph
+from torchslam.optim.observation_graph import ObservationGraph
 
 HERE = Path(__file__).parent
 AXES = torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64)

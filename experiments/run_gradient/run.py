@@ -22,7 +22,8 @@ from torchslam.data.trajectories import interpolate_poses
 from torchslam.evaluation import ate
 from torchslam.geometry import se3_exp, se3_inverse
 from torchslam.optim import GRAPH_OPTIONS
-from torchslam.optim.run_graph import GraphSolution, ObservationGraph, solve_graph
+from torchslam.optim.observation_graph import ObservationGraph
+from torchslam.optim.run_graph import GraphSolution, solve_graph
 from torchslam.system.slam import SLAM
 
 HERE = Path(__file__).parent

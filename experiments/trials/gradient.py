@@ -13,7 +13,7 @@ from experiments.run_gradient.run import Direction, Inputs, check, differentiate
 from experiments.trials.edited import Edited, shots
 from torchslam.data.sequence import Sequence
 from torchslam.geometry import Camera, rigid, so3_exp
-from torchslam.optim.run_graph import ObservationGraph
+from torchslam.optim.observation_graph import ObservationGraph
 from torchslam.system.run import Run
 from torchslam.types import Trajectory
 

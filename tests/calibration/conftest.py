@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from torchslam.geometry import Camera, se3_exp, transform
-from torchslam.optim.run_graph import ObservationGraph
+from torchslam.optim.observation_graph import ObservationGraph
 
 
 @pytest.fixture

@@ -32,7 +32,7 @@ from torchslam.geometry import Camera
 from torchslam.geometry.camera_measurement import CameraMeasurement
 from torchslam.geometry.view_graph_focal import ViewGraphFocal
 from torchslam.global_mapping.mapper import features_to_keep
-from torchslam.optim.run_graph import ObservationGraph
+from torchslam.optim.observation_graph import ObservationGraph
 from torchslam.system.front_end import KeptFeatures, Simulated, true_poses
 
 CAMERA = Camera.pinhole(200.0, 200.0, 159.5, 119.5, size=(320, 240))

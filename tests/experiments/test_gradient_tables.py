@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from experiments.benchmarks import bundle
+from experiments.gradients import training
 from experiments.gradients.compiled import GRADIENTS, HERE
 
 
@@ -10,6 +11,12 @@ def test_the_times_of_compiled_functions_are_those_of_the_experiment() -> None:
     _, _, measured = (HERE / "compiled.md").read_text().partition("| what |")
     _, _, shown = GRADIENTS.read_text().partition("<!-- table -->\n| what |")
     assert shown.partition("<!-- end -->")[0] == measured
+
+
+def test_the_times_of_training_are_those_of_the_experiment() -> None:
+    _, _, measured = (HERE / "training.md").read_text().partition("| what is learned |")
+    _, _, shown = GRADIENTS.read_text().partition(f"{training.START}| what is learned |")
+    assert shown.partition(training.END)[0] == measured
 
 
 def test_the_figures_of_bundle_adjustments_are_those_of_the_benchmark() -> None:

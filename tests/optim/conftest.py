@@ -32,7 +32,8 @@ from torchslam.optim import (
     solve_pose_graph,
 )
 from torchslam.optim.bundle import _dense
-from torchslam.optim.run_graph import GraphSolution, ObservationGraph, solve_graph
+from torchslam.optim.observation_graph import ObservationGraph
+from torchslam.optim.run_graph import GraphSolution, solve_graph
 
 MODELS = ("pinhole", "radial_tangential", "fisheye")
 

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from torchslam.geometry import Camera, se3_exp, transform
-from torchslam.optim.run_graph import ObservationGraph
+from torchslam.optim.observation_graph import ObservationGraph
 
 FRAME_RATE = 30.0
 CAMERA = Camera.radial_tangential(400.0, 400.0, 319.5, 239.5, -0.1, 0.02, 0.0, 0.0, size=(640, 480))

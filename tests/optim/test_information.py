@@ -11,7 +11,7 @@ from tests.optim.conftest import adjusted, solved_graph
 from tests.optim.test_run_graph import aligned_error, simulated
 from torchslam.errors import TorchslamError
 from torchslam.optim import POSE_OPTIONS, solve_bundle, solve_pose
-from torchslam.optim.run_graph import ObservationGraph
+from torchslam.optim.observation_graph import ObservationGraph
 
 CONVERGED = {"iterations": 25, "tolerance": 0.0}
 

@@ -15,6 +15,7 @@ from tests.optim.conftest import solved_graph
 from torchslam.geometry import transform
 from torchslam.geometry.rolling_shutter import Readout
 from torchslam.optim.model_choice import LEAST_GAIN, Gain
+from torchslam.optim.observation_graph import ObservationGraph, concatenate_graphs
 from torchslam.optim.rolling_shutter import (
     RollingShutter,
     ShakingTest,
@@ -23,7 +24,6 @@ from torchslam.optim.rolling_shutter import (
     project_out,
     readout_by,
 )
-from torchslam.optim.run_graph import ObservationGraph, concatenate_graphs
 
 
 def estimated(graph: ObservationGraph) -> RollingShutter:

@@ -17,7 +17,8 @@ from torchslam.evaluation import ate
 from torchslam.geometry.camera_measurement import CameraMeasurement
 from torchslam.geometry.rolling_shutter import Readout
 from torchslam.optim import GRAPH_OPTIONS
-from torchslam.optim.run_graph import GraphSolution, ObservationGraph, solve_graph, solve_graphs
+from torchslam.optim.observation_graph import ObservationGraph
+from torchslam.optim.run_graph import GraphSolution, solve_graph, solve_graphs
 
 DETACHED = GRAPH_OPTIONS.replace(backward="detached")
 READOUT = 0.9  # frame intervals

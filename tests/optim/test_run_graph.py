@@ -14,14 +14,10 @@ from torchslam.geometry import Camera, se3_exp, se3_inverse, transform, umeyama
 from torchslam.geometry.camera_measurement import CameraMeasurement
 from torchslam.optim import GRAPH_OPTIONS, DepthPrior, Factors, log_distance_error
 from torchslam.optim._core.levenberg_marquardt import SolverReason
+from torchslam.optim.bundle._sparse import _newton_steps
 from torchslam.optim.gradient_check import check_gradient
-from torchslam.optim.run_graph import (
-    ObservationGraph,
-    RunGraph,
-    concatenate_graphs,
-    solve_graph,
-    solve_graphs,
-)
+from torchslam.optim.observation_graph import ObservationGraph, RunGraph, concatenate_graphs
+from torchslam.optim.run_graph import solve_graph, solve_graphs
 from torchslam.utils.memory import available_memory
 
 CONVERGED = {"iterations": 25, "tolerance": 0.0}
@@ -619,6 +615,41 @@ def test_a_warm_start_ends_soon_at_the_same_minimum():
     assert warm.keyframes[0].convergence.iterations < cold.keyframes[0].convergence.iterations
     with pytest.raises(ValueError, match=r"start\.T_cw must be"):
         solve_graph(graph, start=replace(before, T_cw=before.T_cw[1:]))
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_last_steps_from_a_warm_start_are_newtons(seed):
+    """With gross errors, of which points may leave one minimum for another one: as exact, in fewer steps."""
+    _, graph = simulated(noise=2.0, frames=12, points=120, seed=seed)
+    graph = replace(graph, is_keyframe=torch.arange(12) % 2 == 0)
+    generator = torch.Generator().manual_seed(seed)
+    wrong = torch.rand(len(graph.pixels), generator=generator) < 0.1
+    graph = replace(graph, pixels=graph.pixels + 12.0 * wrong[:, None])
+    pairs = torch.tensor([(0, 2), (2, 4)])
+    factors = [Factors.distances(pairs, torch.full((2,), 0.4).double(), torch.full((2,), 1e4).double())]
+    before = solve_graph(graph, factors=factors)
+    changed = replace(graph, weights=graph.weights * (1 + 0.1 * graph.pixels[:, 0] / 640))
+    without, found = (
+        solve_graph(changed, factors=factors, start=before, options=GRAPH_OPTIONS.replace(backward=backward))
+        for backward in ("detached", "implicit")
+    )
+    steps, most = (each.keyframes[0].convergence.iterations for each in (found, without))
+    assert found.converged.all()
+    assert steps < most
+    assert steps <= 12
+    # The detached search ends where the cost hardly falls; Newton's at the minimum.
+    assert found.keyframes[0].cost <= without.keyframes[0].cost * (1 + 1e-7)
+    exact = solve_graph(changed, factors=factors, start=found, options=GRAPH_OPTIONS.replace(tolerance=1e-16))
+    torch.testing.assert_close(found.T_cw, exact.T_cw, rtol=0, atol=1e-6)
+
+
+def test_a_step_of_a_point_goes_down_where_the_cost_is_curved_downward():
+    blocks = torch.diag(torch.tensor([4.0, 1.0, 2.0]).double())[None]
+    curved = torch.diag(torch.tensor([2.0, -0.5, 0.0]).double())[None]
+    gradient = torch.tensor([[1.0, 1.0, 1.0]]).double()
+    step = _newton_steps(gradient, blocks, curved)
+    torch.testing.assert_close(step, torch.tensor([[0.5, 2.0, 5.0]]).double())  # the last: a tenth of 2
+    assert not _newton_steps(gradient, torch.zeros_like(blocks), curved).any()
 
 
 def test_the_gradient_check_agrees_and_names_the_gauge():

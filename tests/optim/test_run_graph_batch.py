@@ -12,7 +12,8 @@ from tests.optim.conftest import solved_graph
 from tests.optim.test_run_graph import aligned_error, simulated, two_submaps
 from torchslam.geometry import Camera
 from torchslam.optim import GRAPH_OPTIONS, run_graph
-from torchslam.optim.run_graph import GraphSolution, ObservationGraph, solve_graph, solve_graphs
+from torchslam.optim.observation_graph import ObservationGraph
+from torchslam.optim.run_graph import GraphSolution, solve_graph, solve_graphs
 
 SIZES = ((10, 50, 0), (8, 40, 1), (7, 60, 2))
 COLUMNS = ("T_cw", "points_w", "success", "moved_points", "converged", "submap", "timestamps")

@@ -12,7 +12,7 @@ from torch import Tensor
 from tests.optim.conftest import draw, only
 from torchslam.geometry import Camera, se3_exp, se3_inverse, so3_exp, transform
 from torchslam.optim import GRAPH_OPTIONS, BundleProblem
-from torchslam.optim.run_graph import RunGraph, keyframe_problem
+from torchslam.optim.observation_graph import RunGraph, keyframe_problem
 from torchslam.optim.scale_links import ScaleLinks, scale_links, scale_stds
 
 CAMERA = Camera.pinhole(400.0, 400.0, 319.5, 239.5, size=(640, 480))

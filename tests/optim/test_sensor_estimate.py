@@ -12,7 +12,8 @@ from torchslam.geometry import Camera, SensorModel
 from torchslam.geometry.camera_measurement import CameraMeasurement
 from torchslam.geometry.rolling_shutter import Readout
 from torchslam.optim import GRAPH_OPTIONS
-from torchslam.optim.run_graph import RunGraph, solve_graph
+from torchslam.optim.observation_graph import RunGraph
+from torchslam.optim.run_graph import solve_graph
 from torchslam.optim.sensor_estimate import SensorEstimate, SensorPrior, estimate_sensor, keyframe_evidence
 
 OPTIONS = GRAPH_OPTIONS.replace(backward="detached", tolerance=1e-8)

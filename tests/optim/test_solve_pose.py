@@ -46,6 +46,18 @@ def test_the_gradient_of_the_cost_vanishes_at_the_solution(pose_scene, model):
     assert gradient.abs().max() < 1e-5
 
 
+@pytest.mark.parametrize("kernel", ["none", "huber", "cauchy"])
+def test_the_hessian_of_a_pinhole_camera_is_that_of_any(pose_scene, kernel):
+    scene = pose_scene(outliers=0.2, model="pinhole")
+    weights = 0.5 + torch.rand(scene.pixels.shape[:2], dtype=torch.float64)
+    scale = torch.full((1, 1), 2.0, dtype=torch.float64)
+    problem = PoseProblem(
+        scene.points_w, ReprojectionData(scene.pixels, weights, scene.camera, kernel, scale), None
+    )
+    found = problem.hessian(scene.start)
+    torch.testing.assert_close(found, problem._general_hessian(scene.start), rtol=1e-10, atol=1e-6)
+
+
 def test_batch_is_the_same_as_a_loop(pose_scene):
     scene = pose_scene(batch=3, outliers=0.2)
     scale = torch.tensor([1.0, 2.0, 3.0], dtype=torch.float64)

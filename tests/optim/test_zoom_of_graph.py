@@ -13,7 +13,8 @@ from torch import Tensor
 from torchslam.geometry.camera_measurement import CameraMeasurement
 from torchslam.geometry.zoom import Zoom
 from torchslam.optim import GRAPH_OPTIONS
-from torchslam.optim.run_graph import RunGraph, solve_graph
+from torchslam.optim.observation_graph import RunGraph
+from torchslam.optim.run_graph import solve_graph
 from torchslam.optim.zoom import ZoomEstimate, find_zoom, with_jumps
 
 OPTIONS = GRAPH_OPTIONS.replace(backward="detached", tolerance=1e-6)

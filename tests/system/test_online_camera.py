@@ -16,7 +16,7 @@ from torchslam.data.sequence import Sequence
 from torchslam.errors import ResultsError
 from torchslam.geometry import rigid, so3_exp
 from torchslam.map.file import read_tensors, write_tensors
-from torchslam.optim.run_graph import RunGraph
+from torchslam.optim.observation_graph import RunGraph
 from torchslam.optim.sensor_estimate import SensorEstimate, SensorPrior, estimate_sensor
 from torchslam.system import map_start
 from torchslam.system.checkpoint import read_checkpoint, write_checkpoint

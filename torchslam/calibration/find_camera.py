@@ -27,7 +27,7 @@ from torchslam.geometry import Camera
 from torchslam.geometry.camera_measurement import CameraMeasurement
 from torchslam.geometry.view_graph_focal import ViewGraphFocal, focal_from_pairs
 from torchslam.optim import GRAPH_OPTIONS
-from torchslam.optim.run_graph import ObservationGraph
+from torchslam.optim.observation_graph import ObservationGraph
 from torchslam.optim.sensor_estimate import keyframe_evidence
 from torchslam.system.front_end import Extractor, image_extractor
 from torchslam.system.run import Run

@@ -29,7 +29,7 @@ from torchslam.global_mapping.tracks import (
 )
 from torchslam.global_mapping.view_graph import ViewPair
 from torchslam.optim import BUNDLE_OPTIONS, BundleProblem, solve_bundle
-from torchslam.optim.run_graph import camera_prior
+from torchslam.optim.observation_graph import camera_prior
 from torchslam.types import FrameFeatures
 
 COARSE: tuple[tuple[Kernel, float, float], ...] = (

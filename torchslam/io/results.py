@@ -63,7 +63,7 @@ from torchslam.loop_closing.records import LoopClosureRecord, read_closures
 from torchslam.map.atlas import Submap
 from torchslam.map.file import read_atlas
 from torchslam.map.map import Map
-from torchslam.optim.run_graph import RunGraph
+from torchslam.optim.observation_graph import RunGraph
 from torchslam.types import Explanation, State, StepResult, Trajectory
 from torchslam.utils.console import is_unicode
 from torchslam.utils.files import write_whole

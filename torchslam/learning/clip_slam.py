@@ -22,7 +22,8 @@ from torchslam.features.contract import FixedKeypoints, check_features, check_gr
 from torchslam.features.kornia_modules import KorniaFeatures, is_kornia_module
 from torchslam.geometry import Camera, KeypointNoise, SensorModel
 from torchslam.optim import GRAPH_OPTIONS
-from torchslam.optim.run_graph import GraphSolution, RunGraph, solve_graphs
+from torchslam.optim.observation_graph import RunGraph
+from torchslam.optim.run_graph import GraphSolution, solve_graphs
 from torchslam.system.online_run import finish
 from torchslam.system.slam import SLAM
 from torchslam.types import Features, Frame

@@ -16,7 +16,8 @@ from torchslam.geometry.rolling_shutter import frame_velocities, global_shutter_
 from torchslam.geometry.zoom import Zoom
 from torchslam.map.map import Map, key_of
 from torchslam.map.table import FRAMES, OBSERVATIONS, Table
-from torchslam.optim.run_graph import GraphSolution, RunGraph
+from torchslam.optim.observation_graph import RunGraph
+from torchslam.optim.run_graph import GraphSolution
 from torchslam.types import FrameFeatures, PoseEstimate, Trajectory
 
 

@@ -26,7 +26,7 @@ from torchslam.map.map import Map
 from torchslam.map.observation_index import top_rows
 from torchslam.optim import BUNDLE_OPTIONS, BundleProblem, Progress, solve_bundle
 from torchslam.optim.bundle.dense_numpy import solve_bundle_numpy
-from torchslam.optim.run_graph import camera_prior
+from torchslam.optim.observation_graph import camera_prior
 from torchslam.types import Observations
 from torchslam.utils.indexing import distinct, is_among, ranks_among, true_indices
 

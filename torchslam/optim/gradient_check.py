@@ -17,7 +17,8 @@ from torch import Tensor
 
 from torchslam.geometry.lie import rigid, so3_exp
 from torchslam.optim._core.levenberg_marquardt import GRAPH_OPTIONS, SolverOptions
-from torchslam.optim.run_graph import GraphSolution, ObservationGraph, solve_graph
+from torchslam.optim.observation_graph import ObservationGraph
+from torchslam.optim.run_graph import GraphSolution, solve_graph
 
 Loss = Callable[[GraphSolution], Tensor]
 

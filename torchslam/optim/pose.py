@@ -66,6 +66,8 @@ class PoseModel(NamedTuple):
 class PoseProblem:
     """The least-squares problem of `solve_pose` for `minimize_batch`, with covariances and the exact Hessian."""
 
+    concludes = False
+
     def __init__(self, points_w: Tensor, observations: ReprojectionData, prior: PosePrior | None) -> None:
         """Take finite tensors; rows that do not count have weight zero."""
         self.points_w, self.observations, self.prior = points_w, observations, prior
@@ -92,16 +94,22 @@ class PoseProblem:
 
     def expand(self, T_cw: Float[Tensor, "B 4 4"], use_curvature: Bool[Tensor, " B"]) -> PoseModel:
         """The model of the observations alone."""
+        return self._expanded(T_cw, use_curvature)[0]
+
+    def _expanded(self, T_cw: Tensor, use_curvature: Tensor) -> tuple[PoseModel, Tensor, Tensor, Tensor]:
+        """`expand`, the points (B, 3, N) in the camera, and the rows (B, 7, 2, N), also weighted."""
         points_c = torch.baddbmm(T_cw[:, :3, 3:], T_cw[:, :3, :3], self._columns_w)
         expanded = self._pinhole(points_c) if self._is_pinhole else self._general(points_c)
         rows, (cost, weight, curvature_term) = expanded
-        moments = (rows * (weight[:, None] * self._metric)[:, None]).flatten(2) @ rows.flatten(2).mT
+        weight = weight[:, None] * self._metric
+        weighted = rows * weight[:, None]
+        moments = weighted.flatten(2) @ rows.flatten(2).mT
         hessian, gradient = moments[:, :6, :6], moments[:, :6, 6]
         added = torch.zeros_like(hessian)
-        if use_curvature.any():
+        if self.observations.kernel != "none" and use_curvature.any():
             pulls = (rows[:, :6] * (self._metric[..., None, :, :] * rows[:, 6:])).sum(2)
             added = (pulls * (curvature_term * use_curvature[:, None])[:, None]) @ pulls.mT
-        return PoseModel(T_cw, cost.sum(-1), gradient, hessian, added)
+        return PoseModel(T_cw, cost.sum(-1), gradient, hessian, added), points_c, rows, weighted
 
     def _pinhole(self, points_c: Tensor) -> tuple[Tensor, tuple[Tensor, Tensor, Tensor]]:
         """Rows (B, 7, 2, N) of d residual / d xi and of the residual, in units of the focal length; `weigh`."""
@@ -150,6 +158,9 @@ class PoseProblem:
     def select(self, accept: Tensor, new: PoseModel, old: PoseModel) -> PoseModel:
         return select_models(accept, new, old._replace(curvature_term=torch.zeros_like(old.curvature_term)))
 
+    def concluded(self, model: PoseModel, estimate: Tensor) -> PoseModel:
+        return model._replace(T_cw=estimate)
+
     def covariance(self, T_cw: Float[Tensor, "B 4 4"]) -> Float[Tensor, "B 6 6"]:
         """Covariances (B, 6, 6) at minima, zero where the pose is not determined."""
         lin = linearize(self.observations, transform(T_cw, self.points_w))
@@ -161,6 +172,28 @@ class PoseProblem:
 
     def hessian(self, T_cw: Float[Tensor, "B 4 4"]) -> Float[Tensor, "B 6 6"]:
         """The exact Hessian (B, 6, 6) of the cost in xi."""
+        result = self._pinhole_hessian(T_cw) if self._is_pinhole else self._general_hessian(T_cw)
+        return result if self.prior is None else result + prior_hessian(self.prior, T_cw)
+
+    def _pinhole_hessian(self, T_cw: Tensor) -> Tensor:
+        """Of the observations, in half of the time of `_general_hessian`."""
+        model, points_c, rows, weighted = self._expanded(T_cw, torch.ones_like(self.solvable))
+        depth = points_c[:, 2]
+        inverse = torch.where(depth > torch.finfo(depth.dtype).eps, depth, 1.0).reciprocal()
+        # The curvature of a projection has the entries (0, 2), (1, 2) and half of (2, 2), and their mirror images.
+        pulls = weighted[:, 6] * (inverse * inverse)[:, None]
+        x, y = (-pulls).unbind(1)
+        half = (pulls * points_c[:, :2]).sum(1) * inverse
+        (p, q, _), zero = points_c.unbind(1), torch.zeros_like(half)
+        first = torch.stack((zero, zero, torch.ones_like(half), q, -p, zero), dim=1)
+        second = (x, y, half, half * q - y * depth, x * depth - half * p, y * p - x * q)
+        projected = first @ torch.stack(second, dim=1).mT
+        result = model.hessian + model.curvature_term + projected + projected.mT
+        gradient = (weighted[:, :3] * rows[:, 6:]).sum(2)
+        return result + self._of_rotation(gradient @ points_c.mT)
+
+    def _general_hessian(self, T_cw: Tensor) -> Tensor:
+        """As `_pinhole_hessian`, of any camera."""
         points_c = transform(T_cw, self.points_w)
         gradient, hessian = exact_expansion(self.observations, points_c)
         blocks = hessian.movedim((-2, -1), (0, 1))  # (3, 3, B, N)
@@ -169,13 +202,13 @@ class PoseProblem:
         twice = torch.stack(cross_entries(rays, turned.transpose(0, 1)))
         own, turned, twice = (part.sum(-1).movedim(-1, 0) for part in (blocks, turned, twice))
         rows = torch.cat((own, turned.mT), dim=-1), torch.cat((turned, twice), dim=-1)
-        result = torch.cat(rows, dim=-2)
-        # The curvature of the rotation itself: half of gradient . (omega x (omega x p)).
-        outer = gradient.mT @ points_c
+        return torch.cat(rows, dim=-2) + self._of_rotation(gradient.mT @ points_c)
+
+    def _of_rotation(self, outer: Float[Tensor, "B 3 3"]) -> Float[Tensor, "B 6 6"]:
+        """The curvature of the rotation itself, half of gradient . (omega x (omega x p)), by sums of gradient p^T."""
         trace = outer.diagonal(dim1=-2, dim2=-1).sum(-1)[:, None, None]
         curvature_term = 0.5 * (outer + outer.mT) - trace * self.eye[:3, :3]
-        result = result + torch.nn.functional.pad(curvature_term, (3, 0, 3, 0))
-        return result if self.prior is None else result + prior_hessian(self.prior, T_cw)
+        return torch.nn.functional.pad(curvature_term, (3, 0, 3, 0))
 
 
 class PoseMinimization(Minimization):
@@ -208,6 +241,7 @@ class PoseMinimization(Minimization):
         identity = torch.eye(4, dtype=T_cw.dtype, device=T_cw.device)
         start = torch.where(finite[:, None, None], T_cw, identity)
         options = self.options
+        problem.concludes = options.backward == "implicit"
         model, convergence = minimize_batch(problem, start, options.iterations, options.tolerance)
         with torch.no_grad():
             success = problem.solvable & factorize(model.hessian).definite & finite

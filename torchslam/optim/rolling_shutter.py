@@ -32,7 +32,7 @@ from torchslam.geometry.robust import robustify
 from torchslam.geometry.rolling_shutter import Readout, frame_velocities
 from torchslam.optim._core.levenberg_marquardt import GRAPH_OPTIONS
 from torchslam.optim.model_choice import Gain
-from torchslam.optim.run_graph import ObservationGraph
+from torchslam.optim.observation_graph import ObservationGraph
 
 MIN_FRAMES, MAX_FRAMES = 12, 60
 """Frames of a test, evenly distributed over a run; more take longer without a clearer result."""

@@ -20,7 +20,7 @@ from torchslam.geometry.precision import full_precision
 from torchslam.optim._core.levenberg_marquardt import GRAPH_OPTIONS, SolverOptions
 from torchslam.optim._core.residuals import ReprojectionData, linearize
 from torchslam.optim.bundle._problem import BundleProblem
-from torchslam.optim.run_graph import RunGraph, keyframe_problem
+from torchslam.optim.observation_graph import RunGraph, keyframe_problem
 
 
 @dataclass(frozen=True)

@@ -31,6 +31,7 @@ from torchslam.optim.bundle._problem import BundleProblem
 from torchslam.optim.bundle._scores import camera_scores
 from torchslam.optim.bundle._solve import solve_bundle
 from torchslam.optim.model_choice import Gain
+from torchslam.optim.observation_graph import ObservationGraph, RunGraph, camera_prior, keyframe_problem
 from torchslam.optim.rolling_shutter import (
     MAX_FRAMES,
     RollingShutter,
@@ -38,7 +39,6 @@ from torchslam.optim.rolling_shutter import (
     find_rolling_shutter,
     readout_by,
 )
-from torchslam.optim.run_graph import ObservationGraph, RunGraph, camera_prior, keyframe_problem
 
 MAX_STRETCHES, STRETCH_FRAMES = 10, 3
 """Stretches of a recording, and the least frames of one. By 4 to 20 stretches of seven recordings the errors of the

@@ -33,7 +33,7 @@ from torchslam.optim.bundle._problem import BundleProblem
 from torchslam.optim.bundle._scores import focal_scores
 from torchslam.optim.bundle._solve import solve_bundle
 from torchslam.optim.model_choice import LEAST_GAIN, STRETCHES, Gain
-from torchslam.optim.run_graph import RunGraph, camera_prior, keyframe_problem
+from torchslam.optim.observation_graph import RunGraph, camera_prior, keyframe_problem
 
 NODES, FINE_NODES = 24, 120
 """Most focal lengths along a recording, in the first step, and once a zoom is found. With 24, a test of 152 keyframes

@@ -17,8 +17,9 @@ from torchslam.geometry.zoom import Zoom
 from torchslam.map.atlas import Atlas, Submap
 from torchslam.mapping.local_bundle import adjust_all, noise_variance, squared_errors
 from torchslam.optim import GRAPH_OPTIONS, Progress, SolverOptions, pose_covariance
+from torchslam.optim.observation_graph import RunGraph, keyframe_problem
 from torchslam.optim.rolling_shutter import RollingShutter, ShakingTest
-from torchslam.optim.run_graph import GraphSolution, RunGraph, keyframe_problem, solve_graph
+from torchslam.optim.run_graph import GraphSolution, solve_graph
 from torchslam.optim.sensor_estimate import SensorPrior, estimate_sensor, graph_evidence
 from torchslam.optim.zoom import find_zoom, with_jumps
 from torchslam.system.online_camera import given_readout

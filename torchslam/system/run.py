@@ -17,8 +17,8 @@ from torchslam.map.atlas import Submap, main_submap
 from torchslam.map.map import Map
 from torchslam.map.posed_frames import PosedFrames
 from torchslam.map.unit import MetricUnit
+from torchslam.optim.observation_graph import RunGraph, concatenate_graphs
 from torchslam.optim.rolling_shutter import RollingShutter
-from torchslam.optim.run_graph import RunGraph, concatenate_graphs
 from torchslam.system.online_camera import CameraChange
 from torchslam.types import FrameFeatures, StepResult, Trajectory
 

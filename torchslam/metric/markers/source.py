@@ -30,7 +30,8 @@ from torchslam.metric.meters import MAX_DISAGREEMENT
 from torchslam.metric.options import Given
 from torchslam.metric.source import ScaleMeasurement, ScaleSource, SubmapView, Unmeasured
 from torchslam.optim import GRAPH_OPTIONS
-from torchslam.optim.run_graph import GraphSolution, ObservationGraph, RunGraph, solve_graph
+from torchslam.optim.observation_graph import ObservationGraph, RunGraph
+from torchslam.optim.run_graph import GraphSolution, solve_graph
 
 MIN_VIEWS = 5
 """Keyframes that must see one marker; with fewer, the frames between them are searched as well."""

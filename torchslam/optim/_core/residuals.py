@@ -216,6 +216,11 @@ def gauss_newton_expansion(
     return _expansion(lin, J, flat_along(lin.weight, lin.curvature_term, squared, use_curvature))
 
 
+def newton_expansion(lin: Linearization, J: Float[Tensor, "2 D *batch"]) -> Expansion:
+    """As `gauss_newton_expansion`, with the whole curvature of the kernel: close to the minimum alone."""
+    return _expansion(lin, J, lin.curvature_term)
+
+
 def _expansion(lin: Linearization, J: Float[Tensor, "2 D *batch"], curvature_term: Tensor) -> Expansion:
     """Gradient (D, ..., N) and Hessian (D, D, ..., N) of the cost, without the curvature of the projection."""
     pulled = (J[0] * lin.residual[..., 0]).addcmul(J[1], lin.residual[..., 1])  # J^T r

@@ -148,8 +148,8 @@ def _spread(layout: DenseLayout, values: Tensor) -> Tensor:
     return grid.unflatten(-1, (num_frames, num_points)).transpose(1, 2).contiguous()
 
 
-_CROSS = skew(torch.eye(3, dtype=torch.float64, device="cpu")).transpose(0, 1)
-"""eps_ijk of the cross product: (a x b)_i = eps_ijk a_j b_k."""
+_CROSS = skew(torch.eye(3, dtype=torch.float64, device="cpu")).permute(2, 0, 1).reshape(9, 3)
+"""eps_ijk of the cross product, (a x b)_i = eps_ijk a_j b_k, at (3 k + j, i): flat products b a^T times it."""
 
 
 class DenseEquations(NamedTuple):
@@ -189,17 +189,20 @@ def _sum_by_frame(
     affine = torch.cat((torch.ones_like(rays_w[:, :, :1]), rays_w), dim=2).mT
     pushed = slope @ affine  # (B, K, 3, 4)
     outer = pushed[..., 1:]
-    torque = torch.einsum("bmj,xfjm->xfb", cross, outer)
+    torque = outer.flatten(2) @ cross
     moments = (coupling.flatten(2, 3) @ affine).unflatten(2, (6, 3))  # (B, K, 6, 3, 4)
-    frames = torch.cat((moments[..., 0], torch.einsum("clk,xfakl->xfac", cross, moments[..., 1:])), dim=-1)
+    frames = torch.cat((moments[..., 0], moments[..., 1:].flatten(3) @ cross), dim=-1)
     if exact:
         eye = torch.eye(3, dtype=outer.dtype, device=outer.device)
         trace = outer.diagonal(dim1=-2, dim2=-1).sum(-1)[..., None, None]
         curvature_term = 0.5 * (outer + outer.mT) - trace * eye
         frames = frames + torch.nn.functional.pad(curvature_term, (3, 0, 3, 0))
+    gradient = torch.cat((pushed[..., 0], torque), dim=-1)
+    if not num_camera:
+        return gradient, frames, frames[..., :0]
     sums = (across.flatten(2, 3) @ affine).unflatten(2, (3, num_camera))  # (B, K, 3, P, 4)
-    rotated = torch.einsum("bmj,xfjkm->xfbk", cross, sums[..., 1:])
-    return torch.cat((pushed[..., 0], torque), dim=-1), frames, torch.cat((sums[..., 0], rotated), dim=-2)
+    rotated = (sums[..., 1:].transpose(2, 3).flatten(3) @ cross).mT
+    return gradient, frames, torch.cat((sums[..., 0], rotated), dim=-2)
 
 
 class FactorizedDense(NamedTuple):
@@ -252,6 +255,7 @@ class DenseBundle:
     camera: Camera
     kernel: Kernel
     directions: Float[Tensor, "P n"] | None
+    concludes: bool = False
 
     @property
     def solvable(self) -> Tensor:
@@ -292,6 +296,9 @@ class DenseBundle:
         return BundleEstimate(T_cw, points_w - points, params), predicted_reduction
 
     select = staticmethod(select_models)
+
+    def concluded(self, model: DenseModel, estimate: BundleEstimate) -> DenseModel:
+        return model._replace(estimate=estimate)
 
     def definite(self, model: DenseModel) -> Tensor:
         """Whether (B,) all that moves is determined, up to the gauge."""

@@ -17,7 +17,7 @@ from typing import Literal, NamedTuple
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
-from torch.func import grad, jvp, vjp
+from torch.func import grad, vjp
 
 from torchslam.geometry.lie import se3_inverse, so3_log
 from torchslam.geometry.precision import full_precision
@@ -572,8 +572,9 @@ def factor_slope(
         along = torch.cat([part.flatten(-2) for part in _rows_of(kind, *step[:2])], dim=-1)
         along = step[2] if kind.of_camera else along
         moved = moved_errors(kind, at, own)
-        error, velocity = jvp(moved, (torch.zeros_like(along),), (along,))[:2]
-        slope = slope + torch.einsum("...i,...ij,...j->...", error, matrix, velocity).sum()
+        # That of the cost, by a reverse pass: forward mode takes three times as long.
+        error, pull = _pullback(moved, torch.zeros_like(along))
+        slope = slope + (pull((matrix @ error[..., None]).squeeze(-1)) * along).sum()
     return slope
 
 
