@@ -3,12 +3,14 @@
 python -m experiments.long_loop.run rounds
 python -m experiments.long_loop.run to_and_fro
 python -m experiments.long_loop.run storeys
+python -m experiments.long_loop.run covered
 """
 
 from __future__ import annotations
 
 import math
 import resource
+import shutil
 import subprocess
 import sys
 import time
@@ -16,6 +18,8 @@ from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -41,6 +45,9 @@ FRAMES_PER_LAP = 500
 STOREYS = Path("results") / "storeys"
 """Folder of the rendered walk and of its runs."""
 STOREYS_FRAMES = 1250, 2500, 5000
+COVERED, COVERED_FRAMES, COVERED_WINDOW = range(600, 612), 1250, 80
+"""Frames of the walk that show nothing, as those of a covered lens; frames of that run, and images of its windows."""
+STOREYS_HEADER = "frames | posed | map kept | keyframes | ATE | online ATE | CPU, s | memory, MB"
 
 
 def rounds(frames: int) -> Tensor:
@@ -112,49 +119,71 @@ def processed(slam: SLAM, frames: Iterable[Frame], window: int) -> tuple[list[li
     return rows, results
 
 
-def storeys() -> str:
-    """Table of `torchslam run` on the first frames of a walk through three storeys, which is rendered once."""
+def walk_recording() -> Path:
+    """The walk through three storeys, which is rendered once."""
     recording = STOREYS / "recording"
     if not (recording / "rgb.txt").exists():
         render("synthetic:storeys", recording)
-    focal, size = FOCAL, SIZE
-    camera = f"{focal},{focal},{(size[0] - 1) / 2},{(size[1] - 1) / 2}"
-    rows, per_frame = [], []
-    for frames in STOREYS_FRAMES:
-        output = STOREYS / str(frames)
-        command = ["run", str(recording), "--stop", str(frames), "--camera", camera, "--output", str(output)]
-        if not output.exists():
-            subprocess.run([sys.executable, "-m", "torchslam", *command], check=True, capture_output=True)
-        found = read_metrics(output)
-        per_frame.append(found["cpu_s"] / frames)
-        length = found["path_length_m"]
-        rows.append(
-            [
-                f"{frames}",
-                f"{found['posed']}",
-                f"{found['mapping']}",
-                f"{found['keyframes']}",
-                f"{found['ate_m']:.3f} m ({found['ate_m'] / length:.2%} of {length:.0f} m)",
-                f"{found['online_ate_m']:.3f} m",
-                f"{found['cpu_s']:.0f}",
-                f"{found['peak_memory_mb']:.0f}",
-            ]
-        )
-    header = "frames | posed | map kept | keyframes | ATE | online ATE | CPU, s | memory, MB"
-    growth = per_frame[-1] / per_frame[0]
-    return f"{table(header, rows)}\nCPU time per frame of the last row to that of the first: {growth:.2f}.\n"
+    return recording
+
+
+def run_walk(recording: Path, output: Path, frames: int, *more: str) -> tuple[list[str], float]:
+    """A row of the table, and CPU seconds per frame, of `torchslam run`; a run that is there is not repeated."""
+    camera = f"{FOCAL},{FOCAL},{(SIZE[0] - 1) / 2},{(SIZE[1] - 1) / 2}"
+    command = ["run", str(recording), "--stop", str(frames), "--camera", camera, "--output", str(output)]
+    if not output.exists():
+        words = [sys.executable, "-m", "torchslam", *command, *more]
+        subprocess.run(words, check=True, capture_output=True)
+    found = read_metrics(output)
+    row = [
+        f"{frames}",
+        f"{found['posed']}",
+        f"{found['mapping']}",
+        f"{found['keyframes']}",
+        f"{found['ate_m']:.3f} m ({found['ate_m'] / found['path_length_m']:.2%} of {found['path_length_m']:.0f} m)",
+        f"{found['online_ate_m']:.3f} m",
+        f"{found['cpu_s']:.0f}",
+        f"{found['peak_memory_mb']:.0f}",
+    ]
+    return row, found["cpu_s"] / frames
+
+
+def storeys() -> str:
+    """Table of `torchslam run` on the first frames of a walk through three storeys."""
+    recording = walk_recording()
+    runs = [run_walk(recording, STOREYS / str(frames), frames) for frames in STOREYS_FRAMES]
+    growth = runs[-1][1] / runs[0][1]
+    ratio = f"CPU time per frame of the last row to that of the first: {growth:.2f}."
+    return f"{table(STOREYS_HEADER, [row for row, _ in runs])}\n{ratio}\n"
+
+
+def covered() -> str:
+    """Table of `torchslam run` on that walk with a few frames that show nothing, frame by frame and by default."""
+    whole, recording = walk_recording(), STOREYS / "covered"
+    if not (recording / "rgb.txt").exists():
+        shutil.copytree(whole, recording)
+        for frame in COVERED:
+            path = str(recording / "rgb" / f"{frame:05d}.jpg")
+            cv2.imwrite(path, np.full((SIZE[1], SIZE[0]), 127, np.uint8))
+    window = "--set", f"global_mapping.window_images={COVERED_WINDOW}"
+    ways = ("online", "--mapping", "online"), ("auto", *window)
+    runs = [
+        run_walk(recording, STOREYS / f"covered_{name}", COVERED_FRAMES, *more)[0] for name, *more in ways
+    ]
+    return table(STOREYS_HEADER, runs)
 
 
 def main() -> None:
     parser = parser_of(__doc__, readme=True)
-    parser.add_argument("path", choices=[*FRAMES, "storeys"])
+    walks = {"storeys": storeys, "covered": covered}
+    parser.add_argument("path", choices=[*FRAMES, *walks])
     parser.add_argument("--frames", type=int)
     parser.add_argument("--sequence", default="redkitchen", help="of to_and_fro")
     options = parser.parse_args()
     torch.set_num_threads(1)
     marks = f"<!-- {options.path} -->\n", f"<!-- end {options.path} -->"
-    if options.path == "storeys":
-        publish(storeys(), options, __file__, *marks)
+    if options.path in walks:
+        publish(walks[options.path](), options, __file__, *marks)
         return
     count = options.frames or FRAMES[options.path]
     if options.path == "rounds":

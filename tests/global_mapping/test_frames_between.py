@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from torchslam.global_mapping import frames_between
-from torchslam.global_mapping.frames_between import FollowedViews, Still, Template, gray_of
+from torchslam.global_mapping.frames_between import CELL_PX, FollowedViews, Still, Template, gray_of, spread
 from torchslam.types import Frame, FrameFeatures
 
 HEIGHT, WIDTH = 120, 160
@@ -152,3 +152,23 @@ def test_only_followed_frames_are_extracted_again() -> None:
 def test_frames_that_cannot_be_read_are_left_out() -> None:
     found = Film((2, 4)).views((0, 6), (0, 6), 7)
     assert [view.index for view in found if view is not None] == [0, 1, 3, 5, 6]
+
+
+def test_keypoints_that_are_followed_are_spread() -> None:
+    """The first of each cell, then the second of each, in the order of the rows."""
+    right = torch.tensor([CELL_PX, 0.0], dtype=torch.float64)
+    pixels = torch.tensor([[5.0, 5.0]] * 5, dtype=torch.float64)
+    pixels[3:] += right
+    assert spread(pixels, 2).tolist() == [0, 3]
+    assert spread(pixels, 3).tolist() == [0, 1, 3]
+    assert spread(pixels, 4).tolist() == [0, 1, 3, 4]
+    assert spread(pixels, 9).tolist() == [0, 1, 2, 3, 4]
+    assert spread(pixels[:0], 3).tolist() == []
+
+
+def test_at_most_so_many_are_followed(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(frames_between, "MOST_KEYPOINTS", 3)
+    view = keyframe(0, PIXELS)
+    kept = torch.tensor([True, False, True, True, True])
+    template = Template.of(view, gray_of(picture((0, 0)), 1.0), kept, 1.0)
+    assert template.view.keypoints.tolist() == PIXELS[[0, 2, 3]].tolist()
