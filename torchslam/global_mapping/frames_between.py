@@ -37,8 +37,8 @@ MOST_FOLLOWED = 30
 """Images through which keypoints are followed from a keyframe: further on few are left. Tried at this value only."""
 MOST_KEYPOINTS = 400
 """Keypoints that are followed from a keyframe. All of them, 36 observations of a point on redkitchen, give the same
-errors, in 1.08 times the CPU time and 1.2 times the memory of a whole run; with 250 it takes as long. Tried 250, 400 and
-all, on redkitchen and machine_hall."""
+errors, in 1.08 times the CPU time and 1.2 times the memory of a whole run; with 250 it takes as long. Tried 250, 400
+and all, on redkitchen and machine_hall."""
 CELL_PX = 40.0
 """Side of the cells over which these are spread, in pixels of the images in which features are found."""
 
