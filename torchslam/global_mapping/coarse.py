@@ -116,7 +116,7 @@ class CoarseMapper:
         found = observed.triangulate(known.T_cw, known.camera, COARSE_GATE * FINE[1])
         if float(found.agrees.sum()) < LEAST_AGREEING * max(len(found.agrees), 1):
             return None
-        return CoarseMap(*held, observed, found, [])
+        return CoarseMap(own, more, observed, found, [])
 
     def adjust(
         self,
