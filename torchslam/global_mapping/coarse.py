@@ -109,10 +109,9 @@ class CoarseMapper:
         self, known: KnownPoses, views: list[FrameFeatures], pairs: list[ViewPair], learned: list[ViewPair]
     ) -> CoarseMap | None:
         """The points of views whose poses are known, which stay as they are; None where too few agree."""
-        held = [
-            list(compress(each, rotations_hold(each, known.T_cw[:, :3, :3]))) for each in (pairs, learned)
-        ]
-        observed = ObservedTracks.join(held[0] + held[1], views).longest()
+        R_cw = known.T_cw[:, :3, :3]
+        own, more = (list(compress(each, rotations_hold(each, R_cw))) for each in (pairs, learned))
+        observed = ObservedTracks.join(own + more, views).longest()
         found = observed.triangulate(known.T_cw, known.camera, COARSE_GATE * FINE[1])
         if float(found.agrees.sum()) < LEAST_AGREEING * max(len(found.agrees), 1):
             return None
