@@ -15,7 +15,7 @@ from tests.global_mapping.synthetic import CAMERA, Recording, apart, arc, ball, 
 from tests.walks import T_cw as true_T_cw
 from tests.walks import Walk, still, turn
 from tests.walks import arc as walk_arc
-from torchslam import open_sequence
+from torchslam import SLAM, open_sequence
 from torchslam.config import Config, load_config
 from torchslam.data.sequence import Sequence
 from torchslam.errors import FrameError, InitializationError
@@ -23,6 +23,7 @@ from torchslam.evaluation import evaluate
 from torchslam.geometry import se3_inverse, so3_exp
 from torchslam.geometry.camera_measurement import CameraMeasurement
 from torchslam.global_mapping.check import check_map
+from torchslam.global_mapping.coarse import CoarseMap, CoarseMapper
 from torchslam.global_mapping.mapper import (
     GlobalMap,
     GlobalMapper,
@@ -35,7 +36,8 @@ from torchslam.global_mapping.rounds import COARSE
 from torchslam.global_mapping.view_graph import Relation, ViewPair
 from torchslam.optim.sensor_estimate import CONTRADICTED
 from torchslam.system.front_end import Simulated
-from torchslam.types import State, StepResult
+from torchslam.system.online_run import OnlineRun
+from torchslam.types import FrameFeatures, State, StepResult
 
 WALK = Walk(walk_arc(30))
 
@@ -565,3 +567,24 @@ def test_given_poses_are_those_of_their_frames() -> None:
     run = mapper.adjusted(*mapper.posed(views, *found, frames=[2, 3, 4], given_cw=given_cw))
     assert [each.index for each in run.results] == [2, 4]
     torch.testing.assert_close(run.results[1].T_cw, true_T_cw(WALK)[4])
+
+
+@pytest.mark.parametrize(("doubted", "anew"), [(-1, 0), (20, 2)])
+def test_windows_keep_the_poses_of_an_online_run(
+    doubted: int, anew: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of three windows of fifteen images, two have the doubted frame."""
+    settings, begun, begin = config(), list[int](), CoarseMapper.map
+
+    def counted(self: CoarseMapper, views: list[FrameFeatures], *pairs: list[ViewPair]) -> CoarseMap | str:
+        begun.append(views[0].index)
+        return begin(self, views, *pairs)
+
+    monkeypatch.setattr(CoarseMapper, "map", counted)
+    online = OnlineRun(SLAM(WALK.camera, settings), WALK).run()
+    certain = set(range(30)) - {doubted}
+    results = [result(row, State.TRACKING, is_keyframe=True) for row in range(30)]
+    made = GlobalMapper(WALK, WALK.camera, settings, None).run(results, online, certain)
+    assert len(begun) == anew
+    assert len(made.run.trajectory) == 30
+    assert evaluate(made.run.trajectory, WALK.groundtruth).ate_m < 0.01

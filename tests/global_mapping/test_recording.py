@@ -79,6 +79,7 @@ class World:
         self.mapped: list[Any] = []
         self.given: Any = "not asked"
         self.checked_online = 0
+        self.certain: frozenset[int] | None = None
         self.stages: list[str] = []
         world = self
 
@@ -89,9 +90,9 @@ class World:
                 world.given = given
                 self.config = config
 
-            def run(self, results: Any, before: Run) -> SimpleNamespace:
-                # Keypoints are corrected by the run that the results come from.
-                assert [each.index for each in before.results] == [each.index for each in results]
+            def run(self, results: Any, before: Run, certain: frozenset[int]) -> SimpleNamespace:
+                assert before.results is results  # keypoints are corrected by the run they come from
+                world.certain = certain
                 world.mapped.append(results)
                 return SimpleNamespace(
                     run=world.whole,
@@ -349,3 +350,20 @@ def test_an_online_run_is_checked_by_pairs_of_its_keyframes() -> None:
     simulated = replace(run, config=load_config(None, ["features.kind=simulated"]))
     assert check_run(simulated) is None
     assert check_run(replace(run, submaps=())) is None
+
+
+def test_windows_keep_poses_that_neither_the_run_nor_its_check_doubts(world: World) -> None:
+    """Of a recording longer than a window, the check is asked though frames were lost."""
+    lost, long = a_run(90, lost=10), "global_mapping.window_images=50"
+    world.online_check = replace(a_check(is_broken=True, uncertain=(80,)), certain=tuple(range(80)))
+    world.map(lost, Mapping.AUTO, long)
+    assert world.checked_online == 1
+    assert world.certain == frozenset(range(10, 80))
+    world.online_check = None
+    world.map(lost, Mapping.AUTO, long)
+    assert world.certain == frozenset()
+
+
+def test_a_short_recording_that_was_lost_is_not_checked_before_it_is_mapped(world: World) -> None:
+    world.map(a_run(90, lost=10))
+    assert (world.checked_online, world.certain) == (0, frozenset())

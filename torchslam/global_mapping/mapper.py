@@ -227,12 +227,18 @@ class GlobalMapper:
         self.readout: Readout | None = None  # by which the keypoints of images are corrected
 
     @torch.no_grad()
-    def run(self, results: Rows[StepResult] = (), before: Run | None = None) -> GlobalMap:
+    def run(
+        self,
+        results: Rows[StepResult] = (),
+        before: Run | None = None,
+        certain: Collection[int] = frozenset(),
+    ) -> GlobalMap:
         """Map the recording.
 
-        results: of an online run over it, whose doubtful frames are mapped as well
-        before: that run, whose readout and velocities correct keypoints for a rolling shutter; of a long recording,
-            windows without a doubtful frame keep its poses
+        Args:
+            results: of an online run over it, whose doubtful frames are mapped as well.
+            before: that run, whose readout and velocities correct keypoints for a rolling shutter.
+            certain: frames that nothing casts doubt on: of a long recording, windows of these alone keep their poses.
         """
         if learned_config(self.config) is not None and self.extract is None:
             raise ConfigError(
@@ -251,7 +257,7 @@ class GlobalMapper:
         return_freed_memory()
         held_back = choose_held_back(pairs)
         used = [pair for row, pair in enumerate(pairs) if row not in held_back]
-        known = None if before is None else known_poses(before, results, views)
+        known = None if before is None else known_poses(before, certain, views)
         found = self.reconstruct(views, used, known=known)
         if isinstance(found, str):
             return self._failed(found, views, pairs)
@@ -583,12 +589,11 @@ def map_window(
     return MappedWindow(made.observed, made.found, window.start, kept)
 
 
-def known_poses(run: Run, results: Rows[StepResult], views: list[FrameFeatures]) -> KnownPoses:
-    """The poses of views in the main submap of a run; `results`: which frames are doubtful."""
+def known_poses(run: Run, certain: Collection[int], views: list[FrameFeatures]) -> KnownPoses:
+    """The poses of views in the main submap of a run; `certain`: frames that nothing casts doubt on."""
     T_cw, is_posed = poses_of(run, views)
-    sure = {result.index for result in results if result.state is State.TRACKING}
-    is_sure = torch.tensor([view.index in sure for view in views], dtype=torch.bool, device="cpu")
-    return KnownPoses(T_cw, is_posed & is_sure, run.camera)
+    is_certain = torch.tensor([view.index in certain for view in views], dtype=torch.bool, device="cpu")
+    return KnownPoses(T_cw, is_posed & is_certain, run.camera)
 
 
 def choose_held_back(pairs: list[ViewPair]) -> frozenset[int]:

@@ -262,7 +262,7 @@ def map_recording(
         kept=features,
         processes=processes,
     )
-    made = mapper.run(with_doubts(online.results, check), online)
+    made = mapper.run(online.results, online, _certain(online, check))
     reduction = mapper.config.features.reduction(camera.size)
 
     def checked(run: Run) -> MapCheck:
@@ -314,6 +314,13 @@ def _loss(run: Run) -> str:
         return f"{posed} of {frames} frames are posed in one map"
     lost = sum(result.state is State.LOST for result in run.results)
     return f"tracking was lost in {lost} frames" if lost else ""
+
+
+def _certain(run: Run, check: MapCheck | None) -> frozenset[int]:
+    """The frames that neither a run nor its check doubts; none without a check."""
+    if check is None:
+        return frozenset()
+    return frozenset(each.index for each in with_doubts(run.results, check) if each.state is State.TRACKING)
 
 
 def check_run(run: Run, matched: KeyframePairs | None = None) -> MapCheck | None:
