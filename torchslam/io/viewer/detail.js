@@ -1,13 +1,14 @@
 /* Levels of detail, of view.html and of `torchslam app`.
  *
  * Large clouds, and frusta as a mesh of lines, come in random order. While the view moves, only a first part of them is
- * drawn, as much as the renderer draws at 25 frames a second, on a slow one with half of the resolution and without
- * images; at rest 15 times as much with all of it, which takes below a second. A GPU draws everything at any time.
+ * drawn, as much as the renderer draws in 34 ms, which gives 21 to 24 frames a second (with 40 ms: 19), on a slow one
+ * with half of the resolution and without images; at rest 15 times as much with all of it, which takes below a second.
+ * A GPU draws everything at any time.
  */
 const detail = { scale: 1, changed() {} }; // resolution relative to that of the screen; called when to draw again
 (() => {
   const gl = WebGL2RenderingContext.prototype;
-  const [FRAME_MS, AT_REST, IDLE, BURST, STILL_MS] = [40, 15, 10, 5, 500];
+  const [FRAME_MS, AT_REST, IDLE, BURST, STILL_MS] = [34, 15, 10, 5, 500];
   // Points that are drawn at least, while the view moves and at rest; with a limit below SLOW, the resolution is halved.
   const [LEAST, LEAST_AT_REST, SLOW] = [2000, 150000, 30000];
   const FRUSTUM = { vertices: 24, points: 50 }; // of its lines; points that take as long
