@@ -40,7 +40,8 @@ MOST_KEYPOINTS = 400
 errors, in 1.08 times the CPU time and 1.2 times the memory of a whole run; with 250 it takes as long. Tried 250, 400
 and all, on redkitchen and machine_hall."""
 CELL_PX = 40.0
-"""Side of the cells over which these are spread, in pixels of the images in which features are found."""
+"""Side of the cells over which these are spread, in pixels of the images in which features are found. Tried at this
+value only."""
 
 Gray = UInt8[np.ndarray, "H W"]
 """An image in the size in which features are found."""
