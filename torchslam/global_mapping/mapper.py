@@ -575,9 +575,7 @@ def map_window(
 
     With known poses it enters as it is, unless the images do not agree with them.
     """
-    made: CoarseMap | str | None = None
-    if known is not None:
-        made = coarse.keep(known, views, pairs, learned)
+    made: CoarseMap | str | None = None if known is None else coarse.keep(known, views, pairs, learned)
     if made is None:
         made = saved.window(views, pairs, learned, coarse.camera, coarse.map)
     if isinstance(made, str):

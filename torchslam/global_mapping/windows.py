@@ -91,9 +91,8 @@ class KnownPoses(NamedTuple):
     def of(self, window: range) -> KnownPoses | None:
         """Those of a window that enters as it is; None where an image is doubtful."""
         rows = slice(window.start, window.stop)
-        return (
-            KnownPoses(self.T_cw[rows], self.is_tied[rows], self.camera) if self.is_tied[rows].all() else None
-        )
+        is_tied = self.is_tied[rows]
+        return KnownPoses(self.T_cw[rows], is_tied, self.camera) if bool(is_tied.all()) else None
 
 
 def split(count: int, size: int) -> list[range]:
