@@ -286,7 +286,9 @@ def nearest_by_cosine(
         if len(used_1) > 1:
             return _each_alone(descriptors_1, descriptors_2, mask_1, mask_2, allowed)
         strongest = zip((used_1, used_2), (mask_1, mask_2), strict=True)
-        sample = torch.cat([used[0, :_SAMPLE][mask[0, : used.shape[1]][:_SAMPLE]] for used, mask in strongest])
+        sample = torch.cat(
+            [used[0, :_SAMPLE][mask[0, : used.shape[1]][:_SAMPLE]] for used, mask in strongest]
+        )
         directions = _Directions.of(sample)
         if directions is not None:
             return _nearest_by_directions(used_1, used_2, pairs, directions)
