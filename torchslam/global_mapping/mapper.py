@@ -40,7 +40,7 @@ from torchslam.global_mapping.rounds import (
     adjust_in_rounds,
 )
 from torchslam.global_mapping.saved_stages import SavedStages
-from torchslam.global_mapping.tracks import keypoints_of_tracks, make_map
+from torchslam.global_mapping.tracks import drop_empty_rows, keypoints_of_tracks, make_map
 from torchslam.global_mapping.view_graph import PairMatcher, ViewPair, build_view_graph
 from torchslam.global_mapping.windows import (
     KnownPoses,
@@ -252,6 +252,7 @@ class GlobalMapper:
             views, self.readout = before.at_middle_row(views), before.readout
         if len(views) < MIN_VIEWS:
             return self._failed(f"no map: {len(views)} images are too few", views, [])
+        drop_empty_rows(views)
         matcher = PairMatcher(views, self.camera, self.matcher, self.config)
         pairs = build_view_graph(matcher, partial(self.progress, "matches"), self.saved.pairs)
         return_freed_memory()

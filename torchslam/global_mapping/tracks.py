@@ -207,6 +207,18 @@ def _sums(tracks: Tracks, values: Float[Tensor, "O *n"]) -> Float[Tensor, "N *n"
     return total.view(tracks.count, *values.shape[1:])
 
 
+def drop_empty_rows(views: list[FrameFeatures]) -> None:
+    """Give views as many rows each as the one with most keypoints needs; extractors pad all to the same number.
+
+    In place, one after the other, since descriptors are most of the memory.
+    """
+    used = torch.stack([view.mask for view in views]).any(0).nonzero()
+    most = 1 + int(used.amax()) if len(used) else 0
+    if most < len(views[0].mask):
+        for row, view in enumerate(views):
+            views[row] = replace(view, **{name: getattr(view, name)[:most].clone() for name in KEYPOINT_COLUMNS})
+
+
 def keypoints_of_tracks(views: Sequence[FrameFeatures], tracks: Tracks) -> tuple[list[FrameFeatures], Tracks]:
     """The views without the keypoints that no track has, in as many rows each, and the tracks with these rows.
 

@@ -230,6 +230,7 @@ class FinalAdjustment:
     def _store_covariances(self, submap: Submap) -> None:
         """Store how exact keyframes and points are; the error of the camera is one of the keyframes."""
         assert self._solution is not None
+        return_freed_memory()
         graph = self._graph(submap)
         errors = None if self.calibration is None else self.calibration.directions
         keyframes, *_, problem = keyframe_problem(graph, 0)
