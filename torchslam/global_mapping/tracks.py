@@ -216,7 +216,9 @@ def drop_empty_rows(views: list[FrameFeatures]) -> None:
     most = 1 + int(used.amax()) if len(used) else 0
     if most < len(views[0].mask):
         for row, view in enumerate(views):
-            views[row] = replace(view, **{name: getattr(view, name)[:most].clone() for name in KEYPOINT_COLUMNS})
+            views[row] = replace(
+                view, **{name: getattr(view, name)[:most].clone() for name in KEYPOINT_COLUMNS}
+            )
 
 
 def keypoints_of_tracks(views: Sequence[FrameFeatures], tracks: Tracks) -> tuple[list[FrameFeatures], Tracks]:
