@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -17,6 +18,7 @@ from torchslam.geometry import se3_exp, se3_inverse, so3_exp
 from torchslam.global_mapping.tracks import (
     MIN_PARALLAX,
     Tracks,
+    drop_empty_rows,
     held_parts,
     join_matches,
     longest_tracks,
@@ -25,6 +27,7 @@ from torchslam.global_mapping.tracks import (
     ray_errors,
     triangulate_tracks,
 )
+from torchslam.map.map import KEYPOINT_COLUMNS
 
 TOLERANCE = 0.01
 
@@ -303,6 +306,27 @@ def test_angles_between_rays_and_points_are_known() -> None:
     off = torch.tensor([[0, 0, 2], [aside, 0, 3], [0, 5, 0], [0, 0, -1], [0, 0, 0]], dtype=torch.float64)
     found = torch.rad2deg(ray_errors(ray, centers_w, centers_w + off))
     torch.testing.assert_close(found, torch.tensor([0.0, 0.2, 90, 180, 180]).double(), atol=1e-6, rtol=0)
+
+
+def test_views_lose_the_rows_that_none_uses() -> None:
+    views = Recording.of(line(2), ball(12)).views
+    masks = torch.zeros(2, 12, dtype=torch.bool)
+    masks[0, :3], masks[1, 5] = True, True
+    views = [replace(view, mask=mask) for view, mask in zip(views, masks, strict=True)]
+    before = list(views)
+    drop_empty_rows(views)
+    for view, old in zip(views, before, strict=True):
+        for name in KEYPOINT_COLUMNS:
+            assert torch.equal(getattr(view, name), getattr(old, name)[:6])
+            assert getattr(view, name).untyped_storage().nbytes() < getattr(
+                old, name
+            ).untyped_storage().nbytes() or (getattr(old, name).numel() == 0)
+    kept = list(views)
+    drop_empty_rows(views)
+    assert all(view is old for view, old in zip(views, kept, strict=True))
+    views = [replace(view, mask=torch.zeros_like(view.mask)) for view in views]
+    drop_empty_rows(views)
+    assert [len(view.mask) for view in views] == [0, 0]
 
 
 # --- the map ---------------------------------------------------------------------------------------------------

@@ -34,6 +34,7 @@ from torchslam.global_mapping.view_graph import (
     ViewPair,
     build_view_graph,
     connected_views,
+    most_samples,
     similar_places,
 )
 from torchslam.tracking.matcher import make_matcher
@@ -82,6 +83,23 @@ def test_the_order_is_the_given_one_and_pairs_do_not_change_each_other() -> None
         # A padded batch adds up in another order, and the refinement ends at a step, not at the last digit.
         torch.testing.assert_close(pair.T_21, alone.T_21, atol=1e-8, rtol=0)
         assert pair.relation is alone.relation
+
+
+@pytest.mark.parametrize(
+    ("matches", "samples"), [(20, 64), (24, 64), (40, 146), (50, 448), (60, 500), (400, 500)]
+)
+def test_no_more_samples_are_drawn_than_a_pair_that_just_holds_needs(matches: int, samples: int) -> None:
+    """Of 40 matches 20 must agree: one of log .01 / log(1 - .5^5) = 145.1 samples has no other, at 99 %."""
+    assert most_samples(matches) == samples
+
+
+def test_pairs_of_few_matches_are_searched_with_few_samples(monkeypatch: pytest.MonkeyPatch) -> None:
+    estimate = FakeEstimate(lambda count: count)
+    monkeypatch.setattr("torchslam.global_mapping.view_graph.estimate_relative_pose", estimate)
+    keypoints = torch.arange(40)
+    matcher_of(RECORDING).verify([(0, 1, keypoints, keypoints), (1, 2, keypoints[:24], keypoints[:24])])
+    (options,) = estimate.options
+    assert options["max_samples"] == most_samples(40)
 
 
 def test_a_camera_that_only_turns_gives_a_rotation() -> None:

@@ -42,8 +42,8 @@ _PAIRS_AT_ONCE, _MIN_SAMPLES, _MAX_SAMPLES = 32, 64, 500
 """Pairs that are verified in one batch, which bounds the memory; least and largest number of samples of each.
 Tried at these values only."""
 _SAMPLE, _CONFIDENCE = 5, 0.99
-"""Matches in a sample, and the probability that some sample of a pair that just holds has no outlier. At 0.99, 0.999 and
-0.9999 as many rotations of the held pairs of garden and courthouse are off by more than 5 degrees, 1.6 and 5.7 %."""
+"""Matches in a sample, and the probability that a sample of a pair that just holds has no outlier. At 0.99, 0.999 and
+0.9999 rotations of held pairs are off by more than 5 degrees as often: 1.6 % on garden, 5.7 % on courthouse."""
 
 
 class Relation(Enum):

@@ -42,8 +42,8 @@ _TILE_POINTS, _TILE_POINTS_OF_MANY = 512, 64
 _MANY_FRAMES = 64
 """Frames from which on the tiles are smaller."""
 _STRIP = 120
-"""Columns of a tile's coupling whose products with themselves and all later ones are computed at once. Half of the
-matrix is enough: of 150 frames it takes 7 ms in place of 20. Tried 96 to 960; a multiple of 6, and 96 to 240 are equal."""
+"""Columns of a tile's coupling whose products with themselves and all later ones are computed at once, a multiple of 6.
+Half of the matrix is enough: of 150 frames it takes 7 ms in place of 20. Tried 96 to 960; 96 to 240 are equal."""
 
 AT_ONCE = 1 << 17
 """Observations whose blocks are computed at once, 80 MB, or those of a single frame. With 8,000 or 65,000 an adjustment
