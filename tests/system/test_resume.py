@@ -145,21 +145,22 @@ def test_a_pending_adjustment_is_finished_after_resuming(
     monkeypatch.setattr(mapper, "DELAY_FRAMES", 3)
     for module in (local_bundle, state_machine):
         monkeypatch.setattr(module, "LOCAL_WINDOW", window)
-    whole = SLAM(WALK.camera, CONFIG).run(WALK)
-    slam, so_far = SLAM(WALK.camera, CONFIG), RunProgress()
+    walk = Walk(PATH[:18])
+    whole = SLAM(walk.camera, CONFIG).run(walk)
+    slam, so_far = SLAM(walk.camera, CONFIG), RunProgress()
 
     def cut(result: StepResult) -> None:
         if slam.can_checkpoint and slam.mapper.adjustment.is_pending:
             raise PowerCut
 
     with pytest.raises(PowerCut):
-        OnlineRun(slam, WALK, so_far, observer=Observer(cut)).run()
-    write_checkpoint(tmp_path / "checkpoint", slam, so_far, WALK)
-    resumed, loaded = read_checkpoint(tmp_path / "checkpoint", WALK, CONFIG)
+        OnlineRun(slam, walk, so_far, observer=Observer(cut)).run()
+    write_checkpoint(tmp_path / "checkpoint", slam, so_far, walk)
+    resumed, loaded = read_checkpoint(tmp_path / "checkpoint", walk, CONFIG)
     assert resumed.mapper.adjustment.is_pending
     assert resumed.mapper.adjustment.due == slam.mapper.adjustment.due
     assert resumed.mapper.adjustment.is_due_before_next_frame is (window == 1000)
-    run = OnlineRun(resumed, WALK, loaded).run()
+    run = OnlineRun(resumed, walk, loaded).run()
     assert torch.equal(run.trajectory.T_wc, whole.trajectory.T_wc)
     assert torch.equal(run.online.T_wc, whole.online.T_wc)
 
