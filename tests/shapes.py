@@ -5,6 +5,7 @@ The first calls of each function in each test are checked: all of them would tak
 
 from __future__ import annotations
 
+import contextlib
 import inspect
 import sys
 from collections.abc import Callable
@@ -18,25 +19,32 @@ CHECKS = 8
 
 _check = beartype(conf=BeartypeConf(is_pep484_tower=True))  # an int is a float
 _checks: dict[tuple[str, str], int] = {}
+_with_tensors: set[tuple[str, str]] = set()
 _not_checked: list[Callable[..., Any]] = []
 
 
 def check(function: Callable[..., Any]) -> Callable[..., Any]:
     """Check the tensors that a function takes and returns; mypy checks everything else."""
-    annotations = function.__annotations__
-    function.__annotations__ = {name: hint for name, hint in annotations.items() if "Tensor" in str(hint)}
-    try:
-        checked = _check(function)
-    except BeartypeDecorHintException:  # a hint that only a type checker can read, such as a protocol
-        checked = function
-    # As they were, for those who read them.
-    function.__annotations__ = checked.__annotations__ = annotations
     key = function.__module__, function.__qualname__
+    annotations = function.__annotations__
+    of_tensors = {name: hint for name, hint in annotations.items() if "Tensor" in str(hint)}
+    if of_tensors:
+        _with_tensors.add(key)
+    checked = function
+    # A function within another one is made again in each call of that.
+    if of_tensors and _checks.get(key, 0) < CHECKS:
+        function.__annotations__ = of_tensors
+        with contextlib.suppress(
+            BeartypeDecorHintException
+        ):  # only a type checker can read it, such as a protocol
+            checked = _check(function)
+        # As they were, for those who read them.
+        function.__annotations__ = checked.__annotations__ = annotations
 
     def counted(*args: Any, **kwargs: Any) -> Any:
         _checks[key] = _checks.get(key, 0) + 1
-        if _checks[key] == CHECKS:
-            _stop(*key)
+        if _checks[key] >= CHECKS or key not in _with_tensors:
+            _stop(sys._getframe(1).f_locals.get("fn"), key)
         return checked(*args, **kwargs)
 
     return counted
@@ -50,13 +58,13 @@ def start_test() -> None:
     _not_checked.clear()
 
 
-def _stop(module: str, name: str) -> None:
-    """Let jaxtyping call a function without checks; one within a function cannot be found, and stays checked."""
-    found: Any = sys.modules.get(module)
-    for part in name.split("."):
-        found = inspect.getattr_static(found, part, None)
-    found = found.fget if isinstance(found, property) else getattr(found, "__func__", found)
-    function = inspect.unwrap(found) if callable(found) else None
-    if inspect.isfunction(function) and (function.__module__, function.__qualname__) == (module, name):
-        function.__no_type_check__ = True  # type: ignore[attr-defined]
-        _not_checked.append(function)
+def _stop(function: Any, key: tuple[str, str]) -> None:
+    """Let jaxtyping call a function without checks: in this test, or in all if it takes and returns no tensors.
+
+    function: the one that jaxtyping calls next
+    """
+    is_found = inspect.isfunction(function) and (function.__module__, function.__qualname__) == key
+    if is_found and "__no_type_check__" not in function.__dict__:
+        function.__no_type_check__ = True
+        if key in _with_tensors:
+            _not_checked.append(function)

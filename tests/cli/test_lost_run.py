@@ -23,7 +23,7 @@ from torchslam.system.online_run import Observer, OnlineRun, finish
 
 SETTINGS = ["features.kind=simulated", "features.num_keypoints=250", "simulated.points_per_view=150"]
 SETTINGS += ["simulated.noise_px=0.05", "camera.readout_std=0"]
-FRAMES, LOST = 20, 12
+FRAMES, LOST = 16, 10
 WALK = Walk(arc(45)[:FRAMES])
 
 Run = Callable[..., dict[str, Any]]

@@ -55,12 +55,21 @@ def test_a_loaded_map_is_saved_with_the_same_bytes(first: tuple[SLAM, Run, Path]
     assert loaded.session.number == 1
 
 
-def test_a_new_session_extends_the_map(first: tuple[SLAM, Run, Path], tmp_path: Path) -> None:
+@pytest.fixture(scope="module")
+def second(first: tuple[SLAM, Run, Path], tmp_path_factory: pytest.TempPathFactory) -> tuple[Run, Path]:
+    """The run of a second session, and the file of the submaps that both have made."""
     slam = SLAM.load(first[2], config_of())
     assert slam.map.num_keyframes == first[1].map.num_keyframes
     assert len(slam.trajectory()) == 0
     assert (slam.map.points["last_seen_frame"] == -1).all()  # frames are numbered anew
     run = slam.run(SEEN.part(FIRST - 10))
+    path = tmp_path_factory.mktemp("grown") / "map.safetensors"
+    slam.save(path)
+    return run, path
+
+
+def test_a_new_session_extends_the_map(first: tuple[SLAM, Run, Path], second: tuple[Run, Path]) -> None:
+    run, path = second
     assert len(run.submaps) == 1
     assert run.session == 1
     assert len(run.trajectory) == len(WALK) - FIRST + 10
@@ -74,18 +83,13 @@ def test_a_new_session_extends_the_map(first: tuple[SLAM, Run, Path], tmp_path: 
     assert len(both) == len(submap.trajectory()) == FIRST + len(run.trajectory)
     assert len(run.graph.timestamps) == len(both)  # frames of the same number in both sessions are two
     assert evaluate(submap.trajectory(0), WALK.groundtruth).ate_m < 1e-3
-    slam.save(tmp_path / "grown")
-    assert SLAM.load(tmp_path / "grown", config_of()).session.number == 2
+    assert SLAM.load(path, config_of()).session.number == 2
 
 
-def test_a_third_session_relocalizes_in_both_earlier_ones(
-    first: tuple[SLAM, Run, Path], tmp_path: Path
-) -> None:
-    slam = SLAM.load(first[2], config_of())
-    slam.run(SEEN.part(FIRST - 10))
-    slam.save(tmp_path / "grown")
-    third = SLAM.load(tmp_path / "grown", config_of(), mapping=False)
-    assert len(third.loop_closer.keyframe_database) == slam.map.num_keyframes
+def test_a_third_session_relocalizes_in_both_earlier_ones(second: tuple[Run, Path]) -> None:
+    run, path = second
+    third = SLAM.load(path, config_of(), mapping=False)
+    assert len(third.loop_closer.keyframe_database) == run.map.num_keyframes
     assert third.step(SEEN[45]).reason == "relocalized"
 
 
