@@ -28,6 +28,7 @@ from torchslam.geometry.camera_measurement import (
 from torchslam.geometry.precision import full_precision
 from torchslam.geometry.zoom import Zoom
 from torchslam.optim._core.levenberg_marquardt import SolverOptions
+from torchslam.optim._core.linear import smallest_pivot
 from torchslam.optim._core.tangent import CameraPrior
 from torchslam.optim.bundle._problem import BundleProblem
 from torchslam.optim.bundle._scores import focal_scores
@@ -247,7 +248,9 @@ class _Evidence:
         walk: scale of the step from one node to the next; infinite: independent ones
         """
         eye = torch.eye(len(nodes), dtype=nodes.dtype, device=nodes.device)
-        own = information + self.variance / STD**2 * eye
+        # A factor on all focal lengths changes nothing: exact observations alone leave it open.
+        least = smallest_pivot(nodes.dtype) * float(information.diagonal().amax())
+        own = information + max(self.variance / STD**2, least) * eye
         right = scores + information @ nodes
         if math.isinf(walk):
             return torch.linalg.solve(own, right)
