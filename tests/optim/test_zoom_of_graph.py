@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -15,7 +16,7 @@ from torchslam.geometry.zoom import Zoom
 from torchslam.optim import GRAPH_OPTIONS
 from torchslam.optim.observation_graph import RunGraph
 from torchslam.optim.run_graph import solve_graph
-from torchslam.optim.zoom import ZoomEstimate, find_zoom, with_jumps
+from torchslam.optim.zoom import ZoomEstimate, _Evidence, find_zoom, with_jumps
 
 OPTIONS = GRAPH_OPTIONS.replace(backward="detached", tolerance=1e-6)
 GIVEN = CameraMeasurement.of(CAMERA, 0.02)
@@ -59,6 +60,19 @@ def found(graph: RunGraph) -> ZoomEstimate:
 def test_one_focal_length_is_kept() -> None:
     for seed in range(4):
         assert not found(zoomed(torch.ones_like, seed)).is_found
+
+
+def test_what_exact_observations_leave_open_stays_as_it_is() -> None:
+    """A factor on all focal lengths: their differences alone are known, and the start is the mean."""
+    step = torch.tensor([[-1.0, 1, 0], [0, -1, 1]], dtype=torch.float64)
+    information = (1e4 * step.mT @ step).expand(2, 1, 3, 3)
+    scores = (information @ torch.tensor([0.0, 0.1, 0.3], dtype=torch.float64)[:, None])[..., 0]
+    evidence = _Evidence(scores, information, variance=0.0)
+    moved = evidence.moved(torch.zeros(3, dtype=torch.float64), math.inf)
+    torch.testing.assert_close(
+        moved.diff(), torch.tensor([0.1, 0.2], dtype=torch.float64), atol=1e-6, rtol=0.0
+    )
+    assert abs(float(moved.mean())) < 1e-6
 
 
 @pytest.mark.parametrize(
