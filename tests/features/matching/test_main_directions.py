@@ -66,8 +66,8 @@ def test_directions_hold_what_differs() -> None:
     values = many_units(500, 2)[0].double()
     found = hamming._Directions.of(values)
     assert found is not None
-    assert found.axes.shape == (128, 48)
-    torch.testing.assert_close(found.axes.mT @ found.axes, torch.eye(48, dtype=torch.float64))
+    assert found.axes.shape == (128, 64)
+    torch.testing.assert_close(found.axes.mT @ found.axes, torch.eye(64, dtype=torch.float64))
     ours, true = ((each[:, None] - each).norm(dim=-1) for each in (found.coordinates(values), values))
     assert float((ours - true).abs().max()) < 0.1 * float(true.max())
     assert float((ours - true).max()) < 1e-12  # a projection lengthens nothing

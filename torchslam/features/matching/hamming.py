@@ -159,14 +159,14 @@ class NearestNeighbors(NamedTuple):
 _ROWS_AT_ONCE = 512
 """Rows whose similarities are computed at once: they stay in the cache. 256 to 1024 are equally fast, all 2000 of an
 image take twice as long."""
-_DIRECTIONS, _VARIANCE = 0.375, 0.9
-"""Share of the dimensions of descriptors by which columns are chosen, and what they must hold of the variance: 48 of
-SIFT's 128 hold .92. Then .4 % of the matches that pass mutual and ratio test are lost, and 1.4 % pass that would not,
-with garden, courthouse and machine_hall; with a quarter of the dimensions 1 and 4 %, with half of them .3 and .6 %."""
+_DIRECTIONS, _VARIANCE = 0.5, 0.9
+"""Share of the dimensions of descriptors by which columns are chosen, and what they must hold of the variance: 64 of
+SIFT's 128 hold .96. Of the matches that pass mutual and ratio test with garden, courthouse and machine_hall, .3 % are
+lost then, and .6 % pass that would not; with 48 dimensions .4 and 1.4 % in four fifths of the time, with 32 1 and 4 %."""
 _SAMPLE = 512
 """Descriptors of each set, the strongest, from which directions are found. Tried at this value only."""
 _DIRECTIONS_FROM = 1 << 20
-"""Pairs of descriptors from which on columns are chosen so, on the CPU: 3000 and 3000 take .4 of the time. With fewer
+"""Pairs of descriptors from which on columns are chosen so, on the CPU: 3000 and 3000 take .55 of the time. With fewer
 than 1000 and 1000 there is little to gain."""
 
 
