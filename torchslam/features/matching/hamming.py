@@ -162,7 +162,7 @@ image take twice as long."""
 _DIRECTIONS, _VARIANCE = 0.5, 0.9
 """Share of the dimensions of descriptors by which columns are chosen, and what they must hold of the variance: 64 of
 SIFT's 128 hold .96. Of the matches that pass mutual and ratio test with garden, courthouse and machine_hall, .3 % are
-lost then, and .6 % pass that would not; with 48 dimensions .4 and 1.4 %, in four fifths of the time; with 32 1 and 4."""
+lost then, and .6 % pass that would not. With 48 dimensions it is .4 and 1.4 %, in four fifths of the time."""
 _SAMPLE = 512
 """Descriptors of each set, the strongest, from which directions are found. Tried at this value only."""
 _DIRECTIONS_FROM = 1 << 20
