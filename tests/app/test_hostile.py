@@ -320,7 +320,7 @@ def link_archive() -> bytes:
         archive_of(dots__dots__escaped=b"x"),
         archive_of(**{"__tmp__torchslam-escaped.png": b"x"}),
         link_archive(),
-        archive_of(**{"0.png": bytes(8_000_000)}),
+        archive_of(**{"0.png": bytes(400_000_000)}),
         archive_of(**{"0.png": b"x"})[:-30],
         b"PK\x03\x04 no archive",
     ],

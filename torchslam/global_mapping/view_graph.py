@@ -17,7 +17,7 @@ from torch import Tensor
 
 from torchslam.config import Config
 from torchslam.geometry import Camera, estimate_relative_pose
-from torchslam.geometry.ransac import samples_needed
+from torchslam.geometry.ransac import CONFIDENCE, samples_needed
 from torchslam.loop_closing.keyframe_database import KeyframeDatabase
 from torchslam.tracking.matcher import run_matcher
 from torchslam.types import FrameFeatures, Matcher
@@ -41,10 +41,8 @@ THRESHOLD_PX = 1.5
 _PAIRS_AT_ONCE, _MIN_SAMPLES, _MAX_SAMPLES = 32, 64, 500
 """Pairs that are verified in one batch, which bounds the memory; least and largest number of samples of each.
 Tried at these values only."""
-_SAMPLE, _CONFIDENCE = 5, 0.9999
-"""Matches in a sample, and the probability that one of a pair that just holds has no outlier. At 0.9999 the pairs of
-garden and courthouse are those of 500 samples each. At 0.99 a pair takes a fifth less time, and rotations are off as
-often, but images that few pairs hold may be lost: garden in windows of 50 images had one off by 11 % of the extent."""
+_SAMPLE = 5
+"""Matches in a sample, which determine an essential matrix."""
 
 
 class Relation(Enum):
@@ -130,7 +128,6 @@ class PairMatcher:
             threshold=self.threshold_px,
             mask=mask,
             seed=self.config.seed,
-            confidence=_CONFIDENCE,
             max_samples=most_samples(size),
             kernel="truncated",
             min_samples=_MIN_SAMPLES,
@@ -154,7 +151,7 @@ def least_verified(matches: int) -> float:
 def most_samples(matches: int) -> int:
     """Samples that find the motion of a pair that just holds: of few matches nearly all must agree."""
     least, of = (torch.tensor([round(count)], device="cpu") for count in (least_verified(matches), matches))
-    needed = float(samples_needed(least, of, _SAMPLE, _CONFIDENCE))
+    needed = float(samples_needed(least, of, _SAMPLE, CONFIDENCE))
     return math.ceil(min(max(needed, _MIN_SAMPLES), _MAX_SAMPLES))
 
 

@@ -46,9 +46,8 @@ def test_columns_chosen_by_directions_are_the_nearest(monkeypatch: pytest.Monkey
         assert unasked.second is None
         assert found.second is not None
         assert exact.second is not None
-        assert not torch.equal(
-            found.column, exact.column
-        )  # where nothing is near, another column may be chosen
+        # Where nothing is near, another column may be chosen.
+        assert not torch.equal(found.column, exact.column)
         assert torch.equal(found.found, exact.found)
         sure = exact.distance < 0.5 * exact.second
         assert int(sure.sum()) > 0.9 * same
@@ -85,6 +84,32 @@ def test_without_main_directions_all_dimensions_count(monkeypatch: pytest.Monkey
         assert ours is not None
         assert true is not None
         assert torch.equal(ours, true)
+
+
+@pytest.mark.parametrize("kind", [torch.float64, torch.bfloat16])
+def test_any_floats_are_compared(kind: torch.dtype, monkeypatch: pytest.MonkeyPatch) -> None:
+    one = many_units(90, 0).to(kind)
+    masks = masks_of(90, 90)
+    masks[0][0, :30], masks[1][0, :30] = False, False
+    monkeypatch.setattr(hamming, "_DIRECTIONS_FROM", 1)
+    found = hamming.nearest_by_cosine(one, one.flip(1).flip(1), *masks, None, with_second=True)
+    assert found.distance.dtype == kind
+    assert torch.equal(found.column[0, 30:], torch.arange(30, 90))
+    assert not found.found[0, :30].any()
+    # Without strong descriptors there are no directions.
+    monkeypatch.setattr(hamming, "_SAMPLE", 10)
+    alone = hamming.nearest_by_cosine(one, one, *masks, None, with_second=True)
+    assert torch.equal(alone.column[0, 30:], torch.arange(30, 90))
+
+
+def test_too_many_columns_for_a_key_are_compared_as_they_are(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(hamming, "_DIRECTIONS_FROM", 1)
+    monkeypatch.setattr(hamming, "_INDEX_BITS", 4)
+    monkeypatch.setattr(hamming, "_nearest_by_directions", None)
+    found = hamming.nearest_by_cosine(
+        many_units(9, 0), many_units(20, 0), *masks_of(9, 20), None, with_second=True
+    )
+    assert bool(found.found.all())
 
 
 def test_elements_of_a_batch_are_as_alone(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -118,18 +118,12 @@ def sign_products(
 
 
 def int8_product(
-    left: Int[Tensor, "*batch M K"],
-    right: Int[Tensor, "*batch K N"],
-    out: Int[Tensor, "*batch M N"] | None = None,
+    left: Int[Tensor, "*batch M K"], right: Int[Tensor, "*batch K N"]
 ) -> Num[Tensor, "*batch M N"]:
-    """Multiply int8 matrices: int32 where the processor is quick at it, else float32, exact for sums up to 2^24.
-
-    `out`, int32, is for processors that are quick at it: new pages of memory cost as much as the products.
-    """
+    """Multiply int8 matrices: int32 where the processor is quick at it, else float32, exact for sums up to 2^24."""
     if int8_matmul is None or not _fast_int8(left.device) or 0 in (*left.shape, *right.shape):
         return left.float() @ right.float()
-    if out is None:
-        out = left.new_empty(*left.shape[:-1], right.shape[-1], dtype=torch.int32)
+    out = left.new_empty(*left.shape[:-1], right.shape[-1], dtype=torch.int32)
     factors = (values.reshape(-1, *values.shape[-2:]) for values in (left, right))
     for one, other, product in zip(*factors, out.view(-1, *out.shape[-2:]), strict=True):
         int8_matmul(one, other, out=product)
@@ -281,15 +275,15 @@ def nearest_by_cosine(
     pairs = _Candidates(mask_1, mask_2, allowed, _used(mask_1), _used(mask_2))
     used_1, used_2 = descriptors_1[:, : pairs.rows], descriptors_2[:, : pairs.columns]
     with_gradient = torch.is_grad_enabled() and (descriptors_1.requires_grad or descriptors_2.requires_grad)
-    is_large = pairs.rows * pairs.columns >= _DIRECTIONS_FROM and used_1.is_cpu
-    if with_second and not with_gradient and is_large:
+    is_large = pairs.rows * pairs.columns >= _DIRECTIONS_FROM and pairs.columns <= 1 << _INDEX_BITS
+    if with_second and not with_gradient and is_large and used_1.is_cpu:
         if len(used_1) > 1:
             return _each_alone(descriptors_1, descriptors_2, mask_1, mask_2, allowed)
         strongest = zip((used_1, used_2), (mask_1, mask_2), strict=True)
         sample = torch.cat(
             [used[0, :_SAMPLE][mask[0, : used.shape[1]][:_SAMPLE]] for used, mask in strongest]
         )
-        directions = _Directions.of(sample)
+        directions = _Directions.of(sample.float())
         if directions is not None:
             return _nearest_by_directions(used_1, used_2, pairs, directions)
     if with_gradient:
@@ -342,7 +336,7 @@ def _nearest_by_directions(
     A key is 1 - the squared distance / 2 along the directions, whose lowest bits are replaced with the column.
     """
     index_bits = pairs.columns.bit_length()
-    one, two = (directions.coordinates(each[0]) for each in (descriptors_1, descriptors_2))
+    one, two = (directions.coordinates(each[0].float()) for each in (descriptors_1, descriptors_2))
     ones = [torch.ones_like(each[:, :1]) for each in (one, two)]
     halves = [0.5 * each.square().sum(1, keepdim=True) for each in (one, two)]
     factors_1 = torch.cat((one, 1 - halves[0], ones[0]), dim=1)
@@ -373,7 +367,9 @@ class _Directions(NamedTuple):
 
     @classmethod
     def of(cls, descriptors: Float[Tensor, "N D"]) -> _Directions | None:
-        """By principal components; None if few of these hold too little of the variance."""
+        """By principal components; None if few of these hold too little of the variance, or without descriptors."""
+        if len(descriptors) == 0:
+            return None
         mean = descriptors.mean(0)
         rest = descriptors - mean
         values, vectors = torch.linalg.eigh((rest.mT @ rest).double())

@@ -339,12 +339,11 @@ class NormalEquations:
             reduced[_at(own, frame_rows)] = self.frames_cameras.mT
         flat = reduced.view(-1)
         for _, rows, A in tiles:
-            for begin in range(
-                0, len(rows), _STRIP
-            ):  # the factorization reads what is on and below the diagonal
-                below, own = rows[begin:], rows[begin : begin + _STRIP]
+            # The factorization reads what is on and below the diagonal.
+            for begin in range(0, len(rows), _STRIP):
+                below, strip = rows[begin:], rows[begin : begin + _STRIP]
                 product = A[:, begin:].mT @ A[:, begin : begin + _STRIP]
-                flat.index_add_(0, (below[:, None] * size + own).view(-1), product.view(-1), alpha=-1)
+                flat.index_add_(0, (below[:, None] * size + strip).view(-1), product.view(-1), alpha=-1)
         if gauge is not None:
             c = gauge * reduced.diagonal().mean().sqrt()
             reduced[: len(c), : len(c)] += c @ c.mT
