@@ -9,7 +9,7 @@ import io
 import struct
 import warnings
 import zlib
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
@@ -38,12 +38,13 @@ MAX_BYTES = 1 << 29  # size limit of image files
 MAX_PIXELS = 1 << 26  # maximum number of pixels; a small file may declare any number
 
 
-def write_image(path: Path, pixels: UInt8[np.ndarray, "H W *channels"]) -> None:
+def write_image(path: Path, pixels: UInt8[np.ndarray, "H W *channels"], options: Sequence[int] = ()) -> None:
     """Write gray or BGR pixels in the format that the suffix names; any name of a folder will do.
 
-    OpenCV's own writer takes UTF-8 names only, and reports a failure by its return value. Raises ResultsError.
+    `options` are OpenCV's of the format: alternating flags and values. OpenCV's own writer takes UTF-8 names only, and
+    reports a failure by its return value. Raises ResultsError.
     """
-    is_encoded, content = cv2.imencode(path.suffix, pixels)
+    is_encoded, content = cv2.imencode(path.suffix, pixels, options)
     try:
         if not is_encoded:
             raise OSError(f"OpenCV cannot encode {path.suffix}")

@@ -8,11 +8,13 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import cv2
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int, Shaped
 from torch import Tensor
 
+from torchslam.data.formats.image_file import write_image
 from torchslam.types import State, StepResult
 
 if TYPE_CHECKING:
@@ -46,6 +48,12 @@ _RC: dict[Any, Any] = {
     "savefig.dpi": 150,
 }
 """Settings of matplotlib for all pictures."""
+_FILTER, _UP = 19, 32
+"""OpenCV's IMWRITE_PNG_FILTER and its value UP. OpenCV before 4.12 has no names for them and ignores them."""
+PNG = (cv2.IMWRITE_PNG_COMPRESSION, 1, _FILTER, _UP)
+"""Encoding of the pictures: the difference of each row to the one above, compressed by level 1 of zlib. The five of
+fr2_desk_20 take 70 ms and 1.24 MB; level 3 takes 89 ms and 1.15 MB, or 219 ms and 1.13 MB with a filter chosen for each
+row, as Pillow does."""
 
 
 @contextmanager
@@ -66,15 +74,14 @@ def new_figure(width: float, height: float) -> Figure:
 
 def save(figure: Figure, path: Path) -> None:
     """Write a figure as PNG; the same figure gives the same bytes."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+
     path.parent.mkdir(parents=True, exist_ok=True)
+    canvas = FigureCanvasAgg(figure)
     with house_style():
         figure.set_dpi(_RC["savefig.dpi"])
-        if (layout := figure.get_layout_engine()) is not None:
-            layout.execute(figure)
-            # With an engine everything is drawn twice, the first time for the layout.
-            figure.set_layout_engine("none")
-        # Of zlib's levels 3 takes half of the time of the default, for files that are a tenth larger.
-        figure.savefig(path, format="png", metadata={"Software": None}, pil_kwargs={"compress_level": 3})
+        canvas.draw()  # once with the layout; `Figure.savefig` draws twice
+    write_image(path, cv2.cvtColor(np.asarray(canvas.buffer_rgba()), cv2.COLOR_RGBA2BGR), PNG)
 
 
 def to_numpy(values: Shaped[Tensor, "*shape"]) -> Float[np.ndarray, "*shape"]:
