@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
 from typing import NamedTuple
 
@@ -23,7 +23,7 @@ from jaxtyping import Float, Int
 from numpy.typing import NDArray
 from torch import Tensor
 
-from torchslam.geometry import Camera, se3_inverse
+from torchslam.geometry import Camera, rigid, se3_inverse
 from torchslam.geometry.robust import median_with_error, robustify
 from torchslam.global_mapping.view_graph import Relation, ViewPair
 from torchslam.optim._core.linear import Groups, build_block_structure, factorize_sparse
@@ -43,6 +43,8 @@ WIDTHS = 20.0, 6.0, 3.0
 """Scales of the Cauchy kernel, in standard deviations, each for `STEPS` steps from the last."""
 STEPS = 10
 """Steps of reweighting with each width. Tried at this value only."""
+DIRECTION_STEPS = 6
+"""Steps of reweighting for the direction of a plane. Tried at this value only."""
 ZERO_PRIOR_WEIGHT = 1e-6
 """Relative weight that ties every node to zero: parts that nothing connects stay solvable."""
 
@@ -118,27 +120,52 @@ def chained_positions(
 ) -> Float[Tensor, "K 3"]:
     """Camera centers in a unit of their own, from pairs that determine a direction.
 
+    By its own matches a plane determines one of two directions. Without these pairs, single images of office_loop at
+    a door, which have no others, stay at the origin; by the rotations of all images there is one direction.
+
     Args:
         pairs: verified.
         R_cw: rotations of all images.
         views: features of the images.
         camera: of all images.
     """
-    told = [pair for pair in pairs if pair.relation is Relation.GENERAL]
+    rays = ViewRays(camera, views)
+    told = [
+        pair if pair.relation is Relation.GENERAL else _with_direction(pair, R_cw, rays)
+        for pair in pairs
+        if pair.relation is not Relation.ROTATION
+    ]
     if not told:
         return R_cw.new_zeros(len(R_cw), 3)
-    lengths = pair_lengths(told, views, camera)
+    lengths = pair_lengths(told, rays)
     ends = torch.tensor([(pair.first, pair.second) for pair in told], device=R_cw.device)
     T_12 = se3_inverse(torch.stack([pair.T_21 for pair in told]))
     baselines_w = lengths[:, None] * (R_cw[ends[:, 0]].mT @ T_12[:, :3, 3:])[..., 0]
     return solve_differences(ends, baselines_w, DIRECTION_STD * lengths, len(R_cw))
 
 
-def pair_lengths(
-    pairs: Sequence[ViewPair], views: Sequence[FrameFeatures], camera: Camera
-) -> Float[Tensor, " P"]:
+def _with_direction(pair: ViewPair, R_cw: Float[Tensor, "K 3 3"], rays: ViewRays) -> ViewPair:
+    """A pair with the rotation that all images give it, and the direction in which its matches then agree.
+
+    The direction is the least squares of the distances from epipolar planes, reweighted by Cauchy's kernel.
+    """
+    R_21 = R_cw[pair.second] @ R_cw[pair.first].mT
+    x_1, x_2 = rays.of(pair)
+    turned = x_1 @ R_21.mT
+    normals = torch.linalg.cross(turned, x_2)
+    weights = torch.ones_like(normals[:, 0])
+    for _ in range(DIRECTION_STEPS):
+        t_21 = torch.linalg.eigh((normals * weights[:, None]).mT @ normals).eigenvectors[:, 0]
+        squared = ((normals @ t_21) * (rays.focal / SIGMA_PX)).square()
+        weights = robustify(squared, "cauchy", squared.new_ones(())).weight
+    # Of both signs, that with more of the points in front of the cameras.
+    along = torch.linalg.cross(x_2, turned) * torch.linalg.cross(x_2, t_21.expand_as(x_2))
+    t_21 = t_21.where(along.sum(-1) @ weights <= 0, -t_21)
+    return replace(pair, T_21=rigid(R_21, t_21))
+
+
+def pair_lengths(pairs: Sequence[ViewPair], rays: ViewRays) -> Float[Tensor, " P"]:
     """The lengths of the baselines of pairs, in a common unit; 1 for pairs that share no image with others."""
-    rays = ViewRays(camera, views)
     depths = [PairDepths.of(pair.T_21, rays, pair) for pair in pairs]
     around: dict[int, list[tuple[int, int]]] = {}
     for row, pair in enumerate(pairs):
