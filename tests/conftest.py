@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 from collections.abc import Iterator
 from dataclasses import replace
@@ -14,6 +15,9 @@ import pytest
 import torch
 
 from tests import accelerator, shapes
+
+# What is imported and collected stays: looking for garbage in it takes seconds.
+gc.disable()
 
 # Two torch threads on two busy cores wait for each other at barriers.
 torch.set_num_threads(1)
@@ -40,6 +44,12 @@ def pytest_sessionstart() -> None:
     from torchslam.utils.memory import keep_freed_memory  # not before jaxtyping adds its checks
 
     keep_freed_memory()
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_runtestloop() -> None:
+    gc.freeze()
+    gc.enable()
 
 
 def pytest_runtest_setup() -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -37,6 +37,14 @@ from torchslam.system.front_end import KeptFeatures, Simulated, true_poses
 
 CAMERA = Camera.pinhole(200.0, 200.0, 159.5, 119.5, size=(320, 240))
 CPU = torch.device("cpu")
+
+
+@pytest.fixture(scope="module", autouse=True)
+def few_places() -> Iterator[None]:
+    """Pairs of images from half as many places of a recording."""
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(module, "PLACES", 10)
+        yield
 
 
 @pytest.fixture(scope="module")

@@ -10,6 +10,7 @@ import sys
 import threading
 from functools import partial
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
+from itertools import product
 from pathlib import Path
 
 import cv2
@@ -292,8 +293,14 @@ def test_a_pattern_that_the_shell_expanded(
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="pipes of another kind")
-@pytest.mark.parametrize("unbuffered", ["", "1"])
-@pytest.mark.parametrize("arguments", [["config"], ["--help"], ["info", "/nowhere"]], ids=" ".join)
+@pytest.mark.parametrize(
+    ("arguments", "unbuffered"),
+    [
+        *product([["config"], ["--help"]], ["", "1"]),
+        (["info", "/nowhere"], ""),
+        pytest.param(["info", "/nowhere"], "1", marks=pytest.mark.slow),
+    ],
+)
 def test_a_reader_that_is_gone_is_no_error(arguments: list[str], unbuffered: str) -> None:
     """As in `torchslam ... | head`, with and without the messages in the pipe."""
     command = [sys.executable, "-m", "torchslam", *arguments]

@@ -134,7 +134,9 @@ def test_learned_aggregation_by_option_and_by_the_configuration(run: Path, resul
     assert (results / DEPTHS).read_bytes() == (run / DEPTHS).read_bytes()
 
 
-@pytest.mark.parametrize("other", [["--resolution", "80x64"], ["--aggregation", "learned"]])
+@pytest.mark.parametrize(
+    "other", [["--resolution", "80x64"], pytest.param(["--aggregation", "learned"], marks=pytest.mark.slow)]
+)
 def test_parts_of_other_settings_are_not_used(
     other: list[str], results: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -569,7 +569,7 @@ def test_given_poses_are_those_of_their_frames() -> None:
     torch.testing.assert_close(run.results[1].T_cw, true_T_cw(WALK)[4])
 
 
-@pytest.mark.parametrize(("doubted", "anew"), [(-1, 0), (20, 2)])
+@pytest.mark.parametrize(("doubted", "anew"), [pytest.param(-1, 0, marks=pytest.mark.slow), (20, 2)])
 def test_windows_keep_the_poses_of_an_online_run(
     doubted: int, anew: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:

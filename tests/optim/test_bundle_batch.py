@@ -276,7 +276,7 @@ def test_gradients_of_a_batch_equal_those_of_a_loop(bundle_scene, backward):
         assert (found[row, len(expected) :] == 0).all()
 
 
-@pytest.mark.parametrize("free_camera", [False, True])
+@pytest.mark.parametrize("free_camera", [pytest.param(False, marks=pytest.mark.slow), True])
 def test_gradients_of_a_batch_by_gradcheck(bundle_scene, generator, free_camera):
     """To all that may have a gradient, two cameras, priors, and rows that do not count among it."""
     scenes = [bundle_scene(frames=5, points=14, noise=1.0, perturbation=1e-3, seed=seed) for seed in (0, 3)]

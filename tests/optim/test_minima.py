@@ -80,7 +80,7 @@ def test_elements_that_are_not_determined_are_named(pose_scene):
         fit_line(50, iterations=1, strict=True)
 
 
-@pytest.mark.parametrize("perturbation", [0.01, 0.04])
+@pytest.mark.parametrize("perturbation", [pytest.param(0.01, marks=pytest.mark.slow), 0.04])
 def test_solve_bundle_converges_at_its_defaults_with_a_fifth_of_outliers(bundle_scene, perturbation):
     def distances(problem, **options):
         solution = adjusted(problem, **options)

@@ -19,6 +19,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from tests.parallel.conftest import usual_start
 from torchslam.errors import FrameError
 from torchslam.parallel.pool import WorkerLostError, WorkerPool
 
@@ -94,20 +95,19 @@ def test_a_fork_accepts_calls_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
             assert pool.result(call)[0].tolist() == [number, number]
 
 
-@pytest.mark.parametrize("is_alone", [True, False])
 @pytest.mark.skipif(sys.platform != "linux", reason="workers are forks on Linux alone")
-def test_a_process_with_another_thread_is_not_forked(is_alone: bool) -> None:
-    script = f"""
+def test_a_process_with_another_thread_is_not_forked() -> None:
+    script = """
         import threading
         from torchslam.parallel.pool import can_fork
-        if not {is_alone}:
-            threading.Thread(target=threading.Event().wait, daemon=True).start()
+        print(can_fork())
+        threading.Thread(target=threading.Event().wait, daemon=True).start()
         print(can_fork())
         """
     command = [sys.executable, "-c", textwrap.dedent(script)]
     alone = os.environ | {"OPENBLAS_NUM_THREADS": "1"}  # it begins its threads when NumPy is imported
     done = subprocess.run(command, capture_output=True, text=True, check=True, env=alone)
-    assert done.stdout.split() == [str(is_alone)]
+    assert done.stdout.split() == ["True", "False"]
 
 
 @pytest.mark.usefixtures("start_method")
@@ -120,6 +120,7 @@ def test_an_error_is_raised_by_the_caller_with_its_traceback(error: Exception) -
     assert "in fail" in str(raised.value.__cause__)
 
 
+@usual_start
 def test_a_killed_worker_is_reported_once(pool: WorkerPool) -> None:
     wait_until_ready(pool)
     calls = [pool.submit(None), pool.submit(torch.eye(2))]
@@ -146,6 +147,7 @@ needs_stop = pytest.mark.skipif(not hasattr(signal, "SIGSTOP"), reason="processe
 
 
 @needs_stop
+@usual_start
 def test_a_stopped_worker_is_given_up(pool: WorkerPool, monkeypatch: pytest.MonkeyPatch) -> None:
     wait_until_ready(pool)
     (process,) = multiprocessing.active_children()
@@ -174,6 +176,7 @@ def die(is_asked: bool) -> int:
     return 0
 
 
+@usual_start
 @pytest.mark.usefixtures("start_method")
 def test_a_worker_killed_while_it_sends_a_result_is_not_waited_for() -> None:
     with WorkerPool(2, partial, die) as pool:
@@ -188,6 +191,7 @@ def test_a_worker_killed_while_it_sends_a_result_is_not_waited_for() -> None:
 
 
 @needs_stop
+@usual_start
 @pytest.mark.usefixtures("start_method")
 def test_a_stopped_worker_takes_no_calls_larger_than_its_pipe(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("torchslam.parallel.pool.RESPONSE_TIMEOUT_S", 0.5)
@@ -200,6 +204,7 @@ def test_a_stopped_worker_takes_no_calls_larger_than_its_pipe(monkeypatch: pytes
 
 
 @needs_stop
+@usual_start
 @pytest.mark.usefixtures("start_method")
 def test_a_worker_stopped_while_it_sends_a_result_is_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("torchslam.parallel.pool.RESPONSE_TIMEOUT_S", 0.5)
@@ -213,6 +218,7 @@ def test_a_worker_stopped_while_it_sends_a_result_is_given_up(monkeypatch: pytes
             pool.result(call)
 
 
+@usual_start
 def test_a_worker_is_not_used_after_an_interrupt_within_a_message(
     pool: WorkerPool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -234,6 +240,7 @@ def test_a_worker_is_not_used_after_an_interrupt_within_a_message(
 
 
 @needs_stop
+@usual_start
 def test_a_stopped_worker_can_be_ended(pool: WorkerPool) -> None:
     wait_until_ready(pool)
     os.kill(pool._workers[0].process.pid or 0, signal.SIGSTOP)
@@ -243,6 +250,7 @@ def test_a_stopped_worker_can_be_ended(pool: WorkerPool) -> None:
     assert multiprocessing.active_children() == []
 
 
+@usual_start
 def test_large_calls_and_results_do_not_wait_for_each_other(pool: WorkerPool) -> None:
     wait_until_ready(pool)
     calls = [pool.submit(torch.full((500_000, 2), float(number))) for number in range(5)]
@@ -251,7 +259,7 @@ def test_large_calls_and_results_do_not_wait_for_each_other(pool: WorkerPool) ->
         assert torch.equal(pool.result(call)[0][-1], number * torch.tensor([2.0, 3.0]))
 
 
-@pytest.mark.parametrize("method", ["fork", "spawn"])
+@pytest.mark.parametrize("method", ["fork", pytest.param("spawn", marks=pytest.mark.slow)])
 @pytest.mark.skipif(sys.platform != "linux", reason="workers are forks on Linux alone")
 def test_a_program_that_does_not_end_its_workers_ends(method: str) -> None:
     script = f"""

@@ -55,6 +55,12 @@ def sequence(tmp_path: Path) -> Sequence:
 
 
 @pytest.fixture
+def forked(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Workers are forks where they can be, which need not import torch again."""
+    monkeypatch.setattr("torchslam.parallel.pool.can_fork", lambda: sys.platform == "linux")
+
+
+@pytest.fixture
 def patient(monkeypatch: pytest.MonkeyPatch) -> None:
     """Wait for the processes, so that a short sequence is theirs."""
     enter = FeaturePrefetcher.__enter__
@@ -120,7 +126,7 @@ def test_prefetched_features_equal_those_computed_here(sequence: Sequence) -> No
     assert multiprocessing.active_children() == []
 
 
-@pytest.mark.usefixtures("patient")
+@pytest.mark.usefixtures("forked", "patient")
 def test_small_pictures_come_along_where_they_are_wanted(sequence: Sequence) -> None:
     for is_wanted in (False, True):
         sequence.sends_pictures = is_wanted
@@ -132,7 +138,7 @@ def test_small_pictures_come_along_where_they_are_wanted(sequence: Sequence) -> 
     assert torch.equal(sent, sequence.color(1))  # it is small already
 
 
-@pytest.mark.usefixtures("patient")
+@pytest.mark.usefixtures("forked", "patient")
 def test_few_frames_are_requested_ahead() -> None:
     with ahead(open_sequence("synthetic:room?frames=50&blank=1")) as frames:
         assert frames[10].features is None
@@ -141,7 +147,7 @@ def test_few_frames_are_requested_ahead() -> None:
         assert sorted(frames._requested) == [*range(12, 20)]
 
 
-@pytest.mark.usefixtures("patient")
+@pytest.mark.usefixtures("forked", "patient")
 def test_the_run_continues_without_a_killed_worker(sequence: Sequence) -> None:
     with ahead(sequence) as frames:
         check_same(frames, sequence, 0)
@@ -175,7 +181,7 @@ if __name__ == "__main__":
 @pytest.mark.usefixtures("without_pictures")
 @pytest.mark.skipif(sys.platform != "linux", reason="workers are forks on Linux alone")
 def test_forks_and_new_interpreters_give_the_same_bytes(tmp_path: Path) -> None:
-    folder = write_tum_folder(tmp_path / "room", frames=12)
+    folder = write_tum_folder(tmp_path / "room", frames=8)
     # With 3: one reads frames, one solves local adjustments, one estimates the sensor.
     expected = {2: ["Process"], 3: 3 * ["Process"]}
     arguments = ["run", str(folder), *SET, "--mapping", "online"]
@@ -250,7 +256,7 @@ def wait_for_end(group: int) -> None:
 
 
 @needs_proc
-@pytest.mark.parametrize("method", ["fork", "spawn"])
+@pytest.mark.parametrize("method", ["fork", pytest.param("spawn", marks=pytest.mark.slow)])
 def test_workers_end_with_their_parent(method: str) -> None:
     asking = subprocess.Popen([sys.executable, "-c", ORPHAN, method], start_new_session=True)
     assert asking.wait(PATIENCE) == -signal.SIGKILL

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.parallel.conftest import usual_start
 from tests.parallel.test_pool import wait_until_ready
 from torchslam.errors import FrameError
 from torchslam.parallel.pool import SharedTasks
@@ -55,6 +56,7 @@ def test_each_task_is_done_once_by_all_processes(
     assert str(os.getpid()) in by.values()
 
 
+@usual_start
 @pytest.mark.usefixtures("start_method")
 def test_the_tasks_of_a_killed_worker_are_done_here(tmp_path: Path) -> None:
     with SharedTasks(die_elsewhere, (tmp_path, os.getpid()), 3) as shared:
@@ -65,6 +67,7 @@ def test_the_tasks_of_a_killed_worker_are_done_here(tmp_path: Path) -> None:
     assert len(list(tmp_path.iterdir())) == len(TASKS)
 
 
+@usual_start
 @pytest.mark.usefixtures("start_method")
 def test_an_error_of_a_worker_is_raised_here(tmp_path: Path) -> None:
     with SharedTasks(fail_elsewhere, (tmp_path, os.getpid()), 2) as shared:

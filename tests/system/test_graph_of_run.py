@@ -147,23 +147,22 @@ def adjustment_events(monkeypatch: pytest.MonkeyPatch, walk: Walk, *overrides: s
     return [event for event in events if event[1] in confirmed[1:]]
 
 
+@pytest.mark.parametrize(("delay", "translation"), [pytest.param(1, 0.1, marks=pytest.mark.slow), (2, 0.6)])
 def test_an_adjustment_is_applied_after_some_frames_or_before_the_next_keyframe(
-    monkeypatch: pytest.MonkeyPatch,
+    delay: int, translation: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     walk = Walk(arc(80, 6.0)[:40])
-    for delay, translation in ((1, 0.1), (2, 0.6)):
-        monkeypatch.setattr(mapper, "DELAY_FRAMES", delay)
-        events = adjustment_events(monkeypatch, walk, f"keyframes.max_translation={translation}")
-        kinds = [what for what, _ in events]
-        pairs = len(kinds) // 2
-        assert kinds[: 2 * pairs] == ["requested", "applied"] * pairs  # one after the other
-        waits = [
-            applied - requested
-            for (_, requested), (_, applied) in zip(events[::2], events[1::2], strict=False)
-        ]
-        assert len(waits) >= 3
-        assert set(waits) <= set(range(1, delay + 1))
-        assert delay in waits
+    monkeypatch.setattr(mapper, "DELAY_FRAMES", delay)
+    events = adjustment_events(monkeypatch, walk, f"keyframes.max_translation={translation}")
+    kinds = [what for what, _ in events]
+    pairs = len(kinds) // 2
+    assert kinds[: 2 * pairs] == ["requested", "applied"] * pairs  # one after the other
+    waits = [
+        applied - requested for (_, requested), (_, applied) in zip(events[::2], events[1::2], strict=False)
+    ]
+    assert len(waits) >= 3
+    assert set(waits) <= set(range(1, delay + 1))
+    assert delay in waits
 
 
 @pytest.mark.slow

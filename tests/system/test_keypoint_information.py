@@ -134,6 +134,7 @@ def test_a_resumed_run_with_information_ends_with_the_same_bytes(tmp_path: Path)
     torch.testing.assert_close(resumed.trajectory.T_wc, whole.trajectory.T_wc, atol=1e-3, rtol=0)
 
 
+@pytest.mark.slow
 def test_information_downweights_inaccurate_keypoints() -> None:
     """Every third keypoint is several times as far off as the others; who says so comes out twice as well.
 

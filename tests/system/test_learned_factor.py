@@ -31,6 +31,7 @@ class Wheels(nn.Module):
 
 
 @pytest.mark.data
+@pytest.mark.slow
 def test_the_gradient_to_a_module_is_that_of_solving_again(data_dir: Path) -> None:
     """Of the ATE on shelf_bin, at the default tolerance, along the gradient."""
     sequence = open_sequence(data_dir / "shelf_bin")

@@ -15,6 +15,7 @@ from torchslam import SLAM, Camera, Config, Run, StepResult, Trajectory, evaluat
 from torchslam.data.sequence import Sequence
 from torchslam.errors import ResultsError
 from torchslam.geometry import rigid, so3_exp
+from torchslam.geometry.camera_measurement import CameraMeasurement
 from torchslam.map.file import read_tensors, write_tensors
 from torchslam.optim.observation_graph import RunGraph
 from torchslam.optim.sensor_estimate import SensorEstimate, SensorPrior, estimate_sensor
@@ -167,6 +168,7 @@ def test_poses_go_on_where_the_map_was(corrected: Run) -> None:
     assert float(steps.max()) < 2.0 * float(steps.median())
 
 
+@pytest.mark.slow
 def test_a_right_camera_stays() -> None:
     found = run(1.0)
     assert found.camera_changes == ()
@@ -252,6 +254,9 @@ def test_the_estimate_is_by_the_given_camera_and_the_one_in_use(watched: tuple[R
     slam = calls.slam
     assert {id(prior) for prior in calls.priors} == {id(calls.priors[0])}
     assert calls.priors[0].camera is slam.online_camera.given
+    stated = CameraMeasurement.of(slam.camera, slam.config.camera.std)
+    assert calls.priors[0].camera is not None
+    torch.testing.assert_close(calls.priors[0].camera.directions, stated.directions)
     assert torch.equal(calls.cameras[0].params[:4], slam.camera.params[:4])
     assert calls.cameras[-1] is slam.online_camera.changes[-1].camera
     assert slam.submap is not None
@@ -309,6 +314,7 @@ def test_an_estimate_of_a_map_that_is_gone_is_forgotten(half: tuple[SLAM, Path])
     assert not online.is_pending
 
 
+@pytest.mark.slow
 def test_the_stated_error_of_the_camera_is_a_prior(corrected: Run) -> None:
     """The surer the given camera, the less the images move it."""
     sure = run(OFF, "camera.std=0.002")

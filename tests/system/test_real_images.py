@@ -24,7 +24,10 @@ def real_run(path: Path, frames: int) -> tuple[Sequence, Run]:
 
 
 @pytest.mark.data
-@pytest.mark.parametrize(("name", "frames", "ate_m"), [("shelf_bin", 50, 0.02), ("machine_hall", 40, 0.02)])
+@pytest.mark.parametrize(
+    ("name", "frames", "ate_m"),
+    [("shelf_bin", 50, 0.02), pytest.param("machine_hall", 40, 0.02, marks=pytest.mark.slow)],
+)
 def test_real_images_are_tracked(data_dir: Path, name: str, frames: int, ate_m: float) -> None:
     sequence, run = real_run(data_dir / name, frames)
     assert len(run.trajectory) >= 0.9 * frames

@@ -50,7 +50,7 @@ def test_exact_features_give_the_exact_trajectory() -> None:
     assert all(r.state is State.TRACKING for r in run.results[-15:])
 
 
-@pytest.mark.parametrize("scales", ["false", "true"])
+@pytest.mark.parametrize("scales", [pytest.param("false", marks=pytest.mark.slow), "true"])
 def test_noise_and_outliers_are_tolerated(scales: str) -> None:
     walk = Walk(arc(60)[:20])
     noisy = ("simulated.noise_px=0.5", "simulated.outlier_ratio=0.1")

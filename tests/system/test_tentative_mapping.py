@@ -111,7 +111,7 @@ def test_a_pose_that_disagrees_with_its_matches_is_not_mapped(
     values = {"ratio": 0.1, "matches": 9, "std": 0.1, "translation": 0.1, "degrees": 30.0}
     slam = doubting(monkeypatch, DOUBTFUL, Rejection(rejection, values))
     grown: list[int] = []
-    states = states_of(slam, Walk(arc(60)[:32]), lambda _: grown.append(slam.map.num_keyframes))
+    states = states_of(slam, Walk(arc(60)[: DOUBTFUL.stop]), lambda _: grown.append(slam.map.num_keyframes))
     assert State.UNCERTAIN in states
     assert (len(set(grown[DOUBTFUL[0] - 1 : DOUBTFUL[-1] + 1])) > 1) is is_mapped
 
@@ -131,7 +131,7 @@ def test_a_frame_with_independent_motion_is_mapped_tentatively(
         lambda *_: moving if slam.last_frame and slam.last_frame[0] in DOUBTFUL else NO_MOVEMENT,
     )
     grown: list[int] = []
-    states = states_of(slam, Walk(arc(60)[:32]), lambda _: grown.append(slam.map.num_keyframes))
+    states = states_of(slam, Walk(arc(60)[: DOUBTFUL.stop]), lambda _: grown.append(slam.map.num_keyframes))
     assert State.UNCERTAIN in states
     assert (len(set(grown[DOUBTFUL[0] - 1 : DOUBTFUL[-1] + 1])) > 1) is is_mapped
 

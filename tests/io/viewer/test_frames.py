@@ -102,7 +102,7 @@ def test_watching_does_not_change_the_run() -> None:
     assert torch.equal(runs[0].map.positions_w, runs[1].map.positions_w)
 
 
-@pytest.mark.parametrize("distortion", [0.0, -0.2])
+@pytest.mark.parametrize("distortion", [pytest.param(0.0, marks=pytest.mark.slow), -0.2])
 def test_a_live_view_shows_points_where_their_keypoints_are(tmp_path: Path, distortion: float) -> None:
     rr = pytest.importorskip("rerun")
     from tests.io.export.test_recording import read

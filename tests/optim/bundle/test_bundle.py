@@ -192,8 +192,8 @@ def gradcheck_inputs(scene, generator, model):
         ("pinhole", False),
         ("pinhole", True),
         ("pinhole", torch.tensor([[1.0], [1.02], [0.0], [0.0]], dtype=torch.float64)),
-        ("radial_tangential", False),
-        ("fisheye", False),
+        pytest.param("radial_tangential", False, marks=pytest.mark.slow),
+        pytest.param("fisheye", False, marks=pytest.mark.slow),
     ],
 )
 def test_implicit_gradient_by_gradcheck(bundle_scene, model, free_camera, generator):
@@ -221,7 +221,7 @@ def test_implicit_gradient_by_gradcheck(bundle_scene, model, free_camera, genera
     assert torch.autograd.gradcheck(solve, leaves, eps=1e-6, atol=1e-5, rtol=1e-4, fast_mode=True)
 
 
-@pytest.mark.parametrize("kernel", ["none", "cauchy"])
+@pytest.mark.parametrize("kernel", [pytest.param("none", marks=pytest.mark.slow), "cauchy"])
 def test_covariance_is_calibrated(bundle_scene, kernel):
     """The normalized error squared of poses and points averages to its degrees of freedom."""
     frames, points = [], []
