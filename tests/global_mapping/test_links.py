@@ -122,9 +122,11 @@ def test_matches_are_near_their_epipolar_line(limit_px: float, near: bool) -> No
         keypoints = torch.tensor(pixels, dtype=torch.float64)
         return replace(view, keypoints=keypoints, detected=keypoints, **columns)
 
-    allowed = near_epipolar_line(
+    is_near = near_epipolar_line(
         at((320, 240), (330, 250)), at((320, 228), (260, 228), (600, 250)), T_21, CAMERA, limit_px
     )
+    allowed = is_near(torch.arange(2), torch.arange(3))
+    assert torch.equal(is_near(torch.tensor([1]), torch.tensor([2, 0])), allowed[1:][:, [2, 0]])
     assert allowed.tolist() == [[near, near, True], [False, False, True]]
 
 

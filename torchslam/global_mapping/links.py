@@ -13,20 +13,19 @@ Pollefeys, "LightGlue: local feature matching at light speed", ICCV 2023.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from itertools import product
 from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn.functional import normalize, pad
 
 from torchslam.config import Config
 from torchslam.errors import ConfigError
-from torchslam.features import match
 from torchslam.features.weights import weights_file
 from torchslam.geometry import Camera, se3_inverse
 from torchslam.global_mapping.rounds import ObservedTracks, Reconstruction
@@ -47,9 +46,6 @@ without any test 6 to 24."""
 EPIPOLAR_PX = 12.0
 """Largest distance of a match from its epipolar line, at the size at which features are found: poses are still off. 6
 gives the same."""
-
-_ROWS_AT_ONCE = 256
-"""Keypoints whose distances from lines are computed at once: they stay in the cache, 3 MB. Tried 128 to 1024."""
 
 WEIGHTS = "xfeat-lighterglue"
 """Name of the weights of both networks, which were trained together."""
@@ -129,36 +125,28 @@ def match_guided(
     """
     view_1, view_2 = matcher.views[one], matcher.views[other]
     limit_px = EPIPOLAR_PX * matcher.threshold_px / THRESHOLD_PX
-    own = matcher.matcher
-    if not isinstance(own, DescriptorMatcher) or not view_1.descriptors.is_floating_point():
+    if not isinstance(matcher.matcher, DescriptorMatcher) or not view_1.descriptors.is_floating_point():
         prior = MatchPrior(T_21=T_21, camera=camera, epipolar_px=limit_px)
-        return run_matcher(own, view_1, view_2, prior)
-    found = match(
-        view_1.features,
-        view_2.features,
-        ratio=GUIDED_RATIO * own.settings.max_ratio,
-        max_distance=own.settings.max_cosine_distance,
-        allowed=near_epipolar_line(view_1, view_2, T_21, camera, limit_px)[None],
-    )
-    mask = found.mask[0]
-    return MatchIndices(found.indices_1[0, mask], found.indices_2[0, mask])
+        return run_matcher(matcher.matcher, view_1, view_2, prior)
+    near = near_epipolar_line(view_1, view_2, T_21, camera, limit_px)
+    return matcher.match_two(one, other, GUIDED_RATIO, near)
 
 
 def near_epipolar_line(
     view_1: FrameFeatures, view_2: FrameFeatures, T_21: Float[Tensor, "4 4"], camera: Camera, limit_px: float
-) -> Tensor:
-    """(N1, N2) which keypoints of the second view are near the epipolar line of each of the first."""
+) -> Callable[[Int[Tensor, " R"], Int[Tensor, " C"]], Bool[Tensor, "R C"]]:
+    """Which of some keypoints of the second view are near the epipolar line of each of some of the first.
+
+    In single precision, as the limit is wide.
+    """
     rays = camera.unproject(view_1.keypoints) @ T_21[:3, :3].mT
-    normals = normalize(torch.linalg.cross(T_21[:3, 3].expand_as(rays), rays), dim=-1)
-    normals, rays_2 = normals.float(), camera.unproject(view_2.keypoints).float().mT
+    normals = normalize(torch.linalg.cross(T_21[:3, 3].expand_as(rays), rays), dim=-1).float()
+    rays_2 = camera.unproject(view_2.keypoints).float()
     limit = limit_px / float(camera.focal)
-    # In single precision, as the limit is wide, and with the same memory for the products of all parts: writing them
-    # to new pages takes most of the time.
-    near = torch.empty(len(normals), rays_2.shape[1], dtype=torch.bool, device=normals.device)
-    room = normals.new_empty(_ROWS_AT_ONCE, rays_2.shape[1])
-    for part, of_part in zip(normals.split(_ROWS_AT_ONCE), near.split(_ROWS_AT_ONCE), strict=True):
-        sines = torch.matmul(part, rays_2, out=room[: len(part)])
-        torch.lt(sines.abs_(), limit, out=of_part)
+
+    def near(rows: Tensor, columns: Tensor) -> Tensor:
+        return (normals[rows] @ rays_2[columns].mT).abs_() < limit
+
     return near
 
 

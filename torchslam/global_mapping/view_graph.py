@@ -6,21 +6,24 @@ Pairs are neighbors in time, near ones always, far ones where nearer ones held, 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from enum import Enum
-from functools import partial
+from functools import cached_property, partial
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchslam.config import Config
+from torchslam.features import match
+from torchslam.features.matching.brute_force import match_sorted
+from torchslam.features.matching.cosine import Directions, SortedDescriptors
 from torchslam.geometry import Camera, estimate_relative_pose
 from torchslam.geometry.ransac import CONFIDENCE, samples_needed
 from torchslam.loop_closing.keyframe_database import KeyframeDatabase
-from torchslam.tracking.matcher import run_matcher
-from torchslam.types import FrameFeatures, Matcher
+from torchslam.tracking.matcher import DescriptorMatcher, max_distance, run_matcher
+from torchslam.types import FrameFeatures, Matcher, MatchIndices
 from torchslam.utils.indexing import connected_parts
 
 NEAR = 1, 2, 3, 5, 8
@@ -38,9 +41,16 @@ MIN_RATIO = 0.25
 """Least ratio of verified to all matches: below, repetitive structure or chance explains them; tried 0.15 to 0.4."""
 THRESHOLD_PX = 1.5
 """Distance from the epipolar line, at the size at which features are found: twice the noise of SIFT. Tried 1 to 3."""
+_IMAGES_AT_ONCE = 32
+"""Images that are matched with their near neighbors, and saved, together. Tried at this value only."""
 _PAIRS_AT_ONCE, _MIN_SAMPLES, _MAX_SAMPLES = 32, 64, 500
 """Pairs that are verified in one batch, which bounds the memory; least and largest number of samples of each.
 Tried at these values only."""
+_DIRECTIONS_OF = 16
+"""Most images whose descriptors determine the directions in which they differ. Tried at this value only."""
+_SORTED_AT_ONCE = 48
+"""Sorted descriptors of images that are kept, .5 KB for each keypoint. Images further apart are sorted again, which
+takes a tenth of the time of a match."""
 _SAMPLE = 5
 """Matches in a sample, which determine an essential matrix."""
 
@@ -91,15 +101,62 @@ class PairMatcher:
     def __init__(self, views: list[FrameFeatures], camera: Camera, matcher: Matcher, config: Config) -> None:
         self.views, self.camera, self.matcher, self.config = views, camera, matcher, config
         self.threshold_px = THRESHOLD_PX * config.features.reduction(camera.size)
+        self._sorted: dict[int, SortedDescriptors] = {}
 
     def match(self, pairs: Iterable[tuple[int, int]]) -> list[ViewPair]:
         """The pairs that hold, in the given order."""
         found = []
         for one, other in pairs:
-            matches = run_matcher(self.matcher, self.views[one], self.views[other])
+            matches = self.match_two(one, other)
             if len(matches.first) >= MIN_MATCHES:
                 found.append((one, other, matches.first, matches.second))
         return self.verify(found)
+
+    def match_two(
+        self,
+        one: int,
+        other: int,
+        laxer: float = 1.0,
+        near: Callable[[Tensor, Tensor], Tensor] | None = None,
+    ) -> MatchIndices:
+        """The matches of two images, not verified.
+
+        Args:
+            one, other: rows of the images.
+            laxer: factor on the ratio test of torchslam's own matcher.
+            near: which of some rows and columns, (R, C), its matches may join; None: all.
+        """
+        view_1, view_2 = self.views[one], self.views[other]
+        if not isinstance(self.matcher, DescriptorMatcher) or (self._directions is None and near is None):
+            return run_matcher(self.matcher, view_1, view_2)
+        settings = self.matcher.settings
+        ratio = None if settings.max_ratio is None else laxer * settings.max_ratio
+        limit = max_distance(view_1.descriptors, settings)
+        if self._directions is not None:
+            found = match_sorted(self._sorted_row(one), self._sorted_row(other), ratio, limit, near)
+        else:
+            rows = (torch.arange(len(view.mask), device=view.mask.device) for view in (view_1, view_2))
+            allowed = None if near is None else near(*rows)[None]
+            found = match(view_1.features, view_2.features, ratio, max_distance=limit, allowed=allowed)
+        mask = found.mask[0]
+        return MatchIndices(found.indices_1[0, mask], found.indices_2[0, mask])
+
+    @cached_property
+    def _directions(self) -> Directions | None:
+        """Those by which torchslam's own matcher chooses, of images spread over all; None: it does not."""
+        if not isinstance(self.matcher, DescriptorMatcher):
+            return None
+        chosen = self.views[:: -(-len(self.views) // _DIRECTIONS_OF)]
+        return Directions.of_images([view.descriptors for view in chosen], [view.mask for view in chosen])
+
+    def _sorted_row(self, row: int) -> SortedDescriptors:
+        """The descriptors of an image along the directions; some are kept, since pairs follow each other in time."""
+        if row not in self._sorted:
+            assert self._directions is not None
+            if len(self._sorted) == _SORTED_AT_ONCE:
+                del self._sorted[next(iter(self._sorted))]
+            self._sorted[row] = self._directions.sort(self.views[row].descriptors, self.views[row].mask)
+        return self._sorted[row]
 
     def verify(self, found: list[tuple[int, int, Tensor, Tensor]]) -> list[ViewPair]:
         """Verify matched pairs (first, second, keypoints of either)."""
@@ -164,7 +221,7 @@ def build_view_graph(
 
     Args:
         matcher: of the images, which are in the order of time.
-        progress: called with the number of distances and places done, and of all.
+        progress: called with the number of steps done, and of all.
         match: matches pairs by the matcher, or knows the result; None: `PairMatcher.match`.
 
     Returns:
@@ -172,20 +229,21 @@ def build_view_graph(
     """
     find = partial(match, matcher) if match else matcher.match
     count = len(matcher.views)
-    distances = [distance for distance in NEAR if distance < count]
-    far = FAR
-    while far < count:
-        distances.append(far)
-        far *= 2
+    far = [FAR << doubled for doubled in range(count) if FAR << doubled < count]
+    groups = range(0, count, _IMAGES_AT_ONCE)
+    steps = len(groups) + len(far) + 1
     pairs: list[ViewPair] = []
-    held: Sequence[int] = range(count)  # first images of the pairs that held at the distance before
-    for done, distance in enumerate(distances):
-        progress(done, len(distances) + 1)
-        rows = held if distance >= FAR else range(count)
-        found = find((row, row + distance) for row in rows if row + distance < count)
+    for done, start in enumerate(groups):
+        progress(done, steps)
+        rows = range(start, min(start + _IMAGES_AT_ONCE, count))
+        pairs += find((row, row + distance) for row in rows for distance in NEAR if row + distance < count)
+    held = [pair.first for pair in pairs if pair.second - pair.first == NEAR[-1]]
+    for done, distance in enumerate(far, len(groups)):
+        progress(done, steps)
+        found = find((row, row + distance) for row in held if row + distance < count)
         pairs += found
         held = [pair.first for pair in found]
-    progress(len(distances), len(distances) + 1)
+    progress(steps - 1, steps)
     known = {(pair.first, pair.second) for pair in pairs}
     pairs += find(pair for pair in similar_places(matcher.views) if pair not in known)
     return sorted(pairs, key=lambda pair: (pair.first, pair.second))

@@ -7,18 +7,21 @@ indexing.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import torch
 from jaxtyping import Bool, Float, Int, Shaped
 from torch import Tensor
 
 from torchslam.features.contract import NORMALIZE, are_unit_or_zero
-from torchslam.features.matching.hamming import (
+from torchslam.features.matching.cosine import (
+    SortedDescriptors,
     dual_softmax,
-    hamming,
-    hamming_between,
     nearest_by_cosine,
-    nearest_by_hamming,
+    nearest_of_sorted,
 )
+from torchslam.features.matching.hamming import hamming, hamming_between, nearest_by_hamming
+from torchslam.features.matching.nearest import NearestNeighbors
 from torchslam.geometry.precision import check_positive, without_autocast
 from torchslam.types import Features, Matches
 from torchslam.utils.indexing import true_indices
@@ -71,9 +74,38 @@ def match(
         if temperature is not None:
             similarity = -hamming(descriptors_1, descriptors_2).float()
     else:
-        nearest = nearest_by_cosine(descriptors_1, descriptors_2, *masks, with_second=ratio is not None)
+        nearest = nearest_by_cosine(
+            descriptors_1, descriptors_2, *masks, ratio is not None, max_distance if mutual else None
+        )
         if temperature is not None:
             similarity = descriptors_1 @ descriptors_2.mT
+    mask = _accepted(nearest, columns, ratio, mutual, max_distance)
+    weights = None
+    if temperature is not None and similarity is not None:
+        weights = dual_softmax(similarity / temperature, nearest.column, *masks) * mask
+    return to_matches(nearest.column, nearest.distance, mask, weights)
+
+
+def match_sorted(
+    one: SortedDescriptors,
+    other: SortedDescriptors,
+    ratio: float | None,
+    max_distance: float,
+    allowed: Callable[[Tensor, Tensor], Tensor] | None = None,
+) -> Matches:
+    """`match`, mutually, of sorted descriptors of two images: where an image is matched with many, it is sorted once.
+
+    `allowed`: which of some rows and columns, (R, C), may match; None: all.
+    """
+    nearest = nearest_of_sorted(one, other, max_distance, allowed)
+    mask = _accepted(nearest, len(other.all), ratio, True, max_distance)
+    return to_matches(nearest.column, nearest.distance, mask)
+
+
+def _accepted(
+    nearest: NearestNeighbors, columns: int, ratio: float | None, mutual: bool, max_distance: float | None
+) -> Bool[Tensor, "B N1"]:
+    """The rows that match their nearest column, by the options of `match`."""
     mask = nearest.found
     if max_distance is not None:
         mask = mask & (nearest.distance <= max_distance)
@@ -81,11 +113,7 @@ def match(
         mask = mask & (nearest.distance < ratio * nearest.second)
     if mutual:
         mask = mask & nearest.mutual
-    mask = one_to_one(nearest.column, nearest.distance.detach(), mask, columns)
-    weights = None
-    if temperature is not None and similarity is not None:
-        weights = dual_softmax(similarity / temperature, nearest.column, *masks) * mask
-    return to_matches(nearest.column, nearest.distance, mask, weights)
+    return one_to_one(nearest.column, nearest.distance.detach(), mask, columns)
 
 
 @without_autocast
