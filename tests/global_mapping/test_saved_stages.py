@@ -14,6 +14,7 @@ import torch
 
 from tests.global_mapping.synthetic import Recording, arc, ball
 from tests.global_mapping.test_mapper import WALK, config
+from torchslam.global_mapping import view_graph
 from torchslam.global_mapping.mapper import GlobalMapper
 from torchslam.global_mapping.saved_stages import SavedStages, delete_stages
 from torchslam.global_mapping.view_graph import PairMatcher, Relation, ViewPair
@@ -150,6 +151,7 @@ def test_global_mapping_goes_on_with_the_same_bytes(tmp_path: Path, monkeypatch:
     import torchslam.global_mapping.mapper as module
 
     monkeypatch.setattr(module, "SAVED_TOGETHER", 5)
+    monkeypatch.setattr(view_graph, "_IMAGES_AT_ONCE", 5)
     read, matched = list[int](), list[int]()
     view, match = GlobalMapper.view, PairMatcher.match
 

@@ -1,7 +1,7 @@
 """Pose the frames between the keyframes of a finished map by tracking from keyframe to keyframe.
 
 The keypoints of a keyframe that have a point are followed through the images after it by optical flow, which takes a
-tenth of the time of new features. Where too few can be followed, features are extracted.
+tenth of the time of new features. Where too few can be followed, or the pose is doubtful, features are extracted.
 Source of the flow: Bouguet, "Pyramidal implementation of the Lucas Kanade feature tracker", 2000.
 """
 
@@ -22,7 +22,7 @@ from torchslam.geometry import SensorModel, SharedCamera, transform
 from torchslam.map.atlas import Submap
 from torchslam.map.map import Map
 from torchslam.tracking.data_association import match_keyframe
-from torchslam.tracking.pose_validation import check_pose
+from torchslam.tracking.pose_validation import Rejection, check_pose
 from torchslam.tracking.tracker import Tracker, single_frame_state
 from torchslam.types import Explanation, Frame, FrameFeatures, PoseEstimate, Reason, State, StepResult
 
@@ -250,26 +250,27 @@ def _track(
     view: FrameFeatures,
     again: Callable[[int], FrameFeatures | None] | None,
 ) -> StepResult:
-    """Track a frame from the last keyframe, or relocalize it by the keyframes nearest in time."""
-    view = tracker.at_middle_row(submap, view)
-    estimate = tracker.track(submap, view)
-    extracted = again(view.index) if estimate is None and again is not None else None
-    if extracted is not None:
-        view = tracker.at_middle_row(submap, extracted)
-        estimate = tracker.track(submap, view)
-    tracker.commit(submap, view, estimate)
-    if estimate is None:
-        slam_map = submap.map
-        away = (slam_map.keyframes["frame_index"] - view.index).abs()
-        nearest = torch.argsort(away, stable=True)[:NUM_NEAREST]
-        candidates = (match_keyframe(slam_map, row, view, tracker.matcher) for row in nearest.tolist())
-        points = slam_map.observed_points(nearest)
-        estimate = tracker.localizer.locate(slam_map, view, candidates, points)
-        if estimate is None:
-            reasons = (Explanation(Reason.NOT_FOUND),)
-            return StepResult(view.index, view.timestamp, State.LOST, None, reasons=reasons)
+    """Track a frame from the last keyframe, or relocalize it by the keyframes nearest in time.
+
+    What was followed, the frame's own features, and its relocalization are tried in this order until a pose is not
+    doubtful; else the pose with most inliers is taken.
+    """
+    best: tuple[FrameFeatures, PoseEstimate, bool] | None = None
+    for found in _estimates(tracker, submap, view, again):
+        is_sure = _doubt(submap, found[1]) is None
+        if best is None or is_sure or found[1].inliers > best[1].inliers:
+            best = found
+        if is_sure:
+            break
+    if best is None:
+        tracker.commit(submap, view, None)
+        reasons = (Explanation(Reason.NOT_FOUND),)
+        return StepResult(view.index, view.timestamp, State.LOST, None, reasons=reasons)
+    view, estimate, is_tracked = best
+    tracker.commit(submap, view, estimate if is_tracked else None)
+    if not is_tracked:
         tracker.start_at_estimate(submap, view, estimate)
-    rejection = check_pose(estimate, None, single_frame_state(submap.tracking, estimate)).rejection
+    rejection = _doubt(submap, estimate)
     submap.posed_frames.add(view, estimate, submap.tracking.T_cr, submap.tracking.reference)
     return StepResult(
         view.index,
@@ -282,6 +283,37 @@ def _track(
         inliers=estimate.inliers,
         reasons=(rejection,) if rejection else (),
     )
+
+
+def _estimates(
+    tracker: Tracker,
+    submap: Submap,
+    view: FrameFeatures,
+    again: Callable[[int], FrameFeatures | None] | None,
+) -> Iterator[tuple[FrameFeatures, PoseEstimate, bool]]:
+    """Poses of a frame, each with the view that it is of, and whether it was tracked."""
+    own = tracker.at_middle_row(submap, view)
+    estimate = tracker.track(submap, own)
+    if estimate is not None:
+        yield own, estimate, True
+    extracted = None if again is None else again(view.index)
+    if extracted is not None:
+        own = tracker.at_middle_row(submap, extracted)
+        estimate = tracker.track(submap, own)
+        if estimate is not None:
+            yield own, estimate, True
+    slam_map = submap.map
+    away = (slam_map.keyframes["frame_index"] - view.index).abs()
+    nearest = torch.argsort(away, stable=True)[:NUM_NEAREST]
+    candidates = (match_keyframe(slam_map, row, own, tracker.matcher) for row in nearest.tolist())
+    estimate = tracker.localizer.locate(slam_map, own, candidates, slam_map.observed_points(nearest))
+    if estimate is not None:
+        yield own, estimate, False
+
+
+def _doubt(submap: Submap, estimate: PoseEstimate) -> Rejection | None:
+    """Why the pose of a frame is doubtful by itself; None if it is not."""
+    return check_pose(estimate, None, single_frame_state(submap.tracking, estimate)).rejection
 
 
 def _keyframe_estimate(slam_map: Map, keyframe: int) -> PoseEstimate:

@@ -12,7 +12,7 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, Shaped
 from torch import Tensor
 
 from torchslam.features.matching.nearest import INDEX_BITS, Candidates, NearestNeighbors, column_of
@@ -77,7 +77,7 @@ class Directions(NamedTuple):
 
     @classmethod
     def of_images(
-        cls, descriptors: list[Float[Tensor, "_ D"]], masks: list[Bool[Tensor, " _"]]
+        cls, descriptors: list[Shaped[Tensor, "_ D"]], masks: list[Bool[Tensor, " _"]]
     ) -> Directions | None:
         """The directions by the strongest descriptors of images.
 
