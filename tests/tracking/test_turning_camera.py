@@ -112,7 +112,7 @@ def test_the_turns_during_a_readout_are_measured() -> None:
     rates = torch.tensor([0.04, 0.04 + 0.002 * 13], dtype=torch.float64)
     torch.testing.assert_close(turns[:, 1], -0.6 * rates, atol=0, rtol=0.15)
     everything = torch.ones(len(pixels[0]), dtype=torch.bool)
-    assert turning.explains(found, everything, 0.6)
+    assert found.explains(everything[None], 0.6)[0]
     middle_1, middle_2 = turning.at_middle_rows(pixels, turns)
     R_21 = (T_cw[-1] @ se3_inverse(T_cw[0]))[:3, :3]
     mapped, _ = CAMERA.project(CAMERA.unproject(middle_1) @ R_21.mT)
@@ -122,12 +122,12 @@ def test_the_turns_during_a_readout_are_measured() -> None:
 def test_a_readout_that_is_known_is_not_fitted() -> None:
     views = views_of(walk(14, 0.0), 0.6, noise=0.1)
     interval = views[1].timestamp - views[0].timestamp
-    turning, found, turns, pixels = fitted(views, Readout.known(0.6 * interval, 0.01 * interval))
+    _, found, turns, pixels = fitted(views, Readout.known(0.6 * interval, 0.01 * interval))
     assert float(found.readout) == 0.0
     rates = torch.tensor([0.04, 0.04 + 0.002 * 13], dtype=torch.float64)
     torch.testing.assert_close(turns[:, 1], -0.6 * rates, atol=0, rtol=0.05)
     everything = torch.ones(len(pixels[0]), dtype=torch.bool)
-    assert turning.explains(found, everything, 0.6)
+    assert found.explains(everything[None], 0.6)[0]
 
 
 def test_a_readout_is_not_fitted_where_none_is_wanted_or_measured() -> None:
@@ -143,5 +143,5 @@ def test_a_readout_is_not_fitted_where_none_is_wanted_or_measured() -> None:
 
 
 def test_a_moving_camera_is_not_explained_by_a_rotation() -> None:
-    turning, found, _, pixels = fitted(views_of(walk(10, 0.05), 0.0))
-    assert not turning.explains(found, torch.ones(len(pixels[0]), dtype=torch.bool), 0.5)
+    _, found, _, pixels = fitted(views_of(walk(10, 0.05), 0.0))
+    assert not found.explains(torch.ones(len(pixels[0]), dtype=torch.bool)[None], 0.5)[0]

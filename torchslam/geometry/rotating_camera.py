@@ -7,6 +7,7 @@ after the other, and the camera turns in between. Source: Hedborg et al., "Rolli
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import torch
@@ -21,12 +22,20 @@ from torchslam.geometry.ransac import ModelState, best_of, levenberg_marquardt
 from torchslam.geometry.robust import robustify
 from torchslam.geometry.rolling_shutter import row_fractions
 from torchslam.geometry.similarity import nearest_rotation
-from torchslam.geometry.two_view import TwoViews, fit_rotation, propose_rotation
+from torchslam.geometry.two_view import TRANSFER_WIDTH, TwoViews, fit_rotation, propose_rotation
 
 _STARTS = 3  # focal lengths, over twice the standard deviation to both sides; the best result counts
 _ITERATIONS = 10
 """Of Levenberg-Marquardt from each start. Tried at this value only."""
 _KERNEL_SCALE = 2.0  # thresholds at which the Huber kernel becomes linear
+MAX_FOCAL_SIGMAS = 3.0
+"""Largest departure from the focal length of the camera with which a rotation may explain the matches."""
+MAX_CONTRADICTING_RATIO = 0.05
+"""Ratio of the matches that may contradict a rotation with another focal length.
+
+Of rendered rotations it is 0.01 or less, with any guess of the focal length and either ORB. Where two frames of real
+sequences determine a map, it is 0.13 or more.
+"""
 READOUT_STD = 0.5
 """Standard deviation of the readout time about zero, in intervals between frames; it is below one. Tried at this value
 only."""
@@ -49,6 +58,13 @@ class RotatingCamera:
     readout_std: Float[Tensor, " B"]
     departure: Float[Tensor, " B"]
     errors_px: Float[Tensor, "B N"]
+
+    def explains(self, mask: Bool[Tensor, "B N"], noise_px: float) -> Bool[Tensor, " B"]:
+        """Whether the rotation explains those matches that are known to so many pixels."""
+        # Errors in two dimensions, with the noise of both views.
+        off = (self.errors_px > math.sqrt(2) * TRANSFER_WIDTH * noise_px) & mask
+        is_near = off.sum(-1) <= MAX_CONTRADICTING_RATIO * mask.sum(-1)
+        return is_near & (self.departure <= MAX_FOCAL_SIGMAS)
 
 
 @full_precision

@@ -22,7 +22,8 @@ from torchslam.global_mapping.rounds import (
     Reconstruction,
     adjust_coarsely,
 )
-from torchslam.global_mapping.view_graph import Relation, ViewPair, connected_views
+from torchslam.global_mapping.turning import turning_focal
+from torchslam.global_mapping.view_graph import THRESHOLD_PX, Relation, ViewPair, connected_views
 from torchslam.global_mapping.windows import KnownPoses, rotations_hold
 from torchslam.optim import ROTATION_OPTIONS
 from torchslam.optim.rotation_averaging import solve_rotations
@@ -56,7 +57,7 @@ class CoarseMap(NamedTuple):
     unposed: list[ViewPair]
 
 
-def _silent(stage: str, done: int, most: int) -> None:
+def silent(stage: str, done: int, most: int) -> None:
     pass
 
 
@@ -68,11 +69,13 @@ class CoarseMapper:
         camera: of all images.
         given: the camera with its error; None: it is exact.
         progress: receives stages.
+        threshold_px: distance from the epipolar line up to which matches were verified.
     """
 
     camera: Camera
     given: CameraMeasurement | None
-    progress: Callable[[str, int, int], None] = _silent
+    progress: Callable[[str, int, int], None] = silent
+    threshold_px: float = THRESHOLD_PX
 
     def map(
         self, views: list[FrameFeatures], pairs: list[ViewPair], learned: list[ViewPair]
@@ -96,6 +99,9 @@ class CoarseMapper:
         if len(pairs) - others < MIN_GENERAL * len(pairs):
             about = f"{others} of {len(pairs)} pairs of images"
             return f"no map: the camera stands still, only turns, or sees a plane in {about}"
+        focal = None if self.given is None else turning_focal(pairs, views, self.given, self.threshold_px)
+        if focal is not None:
+            return f"no map: the camera only turns, with a focal length of about {focal:.0f} px"
         connected = set(connected_views(pairs, len(views)).tolist())
         own = sum(pair.first in connected for pair in pairs[:own])
         pairs = [pair for pair in pairs if pair.first in connected]

@@ -225,7 +225,7 @@ class Initializer:
         # The noise of both views is in the distance from an epipolar line.
         across = self._offsets(relative.T_21[0], matches.of(inliers)).median()
         noise = min(max(float(across) / (math.sqrt(2) * NORMAL_MEDIAN), LEAST_NOISE), 1.0)
-        if self.turning.explains(turned, inliers, NOISE_SIGMAS * noise):
+        if bool(turned.explains(inliers[None], NOISE_SIGMAS * noise)[0]):
             return None
         found = self._triangulate(matches.of(inliers), relative.T_21[0], MIN_GOOD_RATIO, noise)
         return found if isinstance(found, TwoViewMap) else None
@@ -243,7 +243,7 @@ class Initializer:
         if self.turning.std == 0 or not bool(inliers.any()):
             return None
         turned, _ = self.turning.fit(*matches.pixels, inliers)
-        if not self.turning.explains(turned, inliers, self.threshold_px):
+        if not bool(turned.explains(inliers[None], self.threshold_px)[0]):
             return None
         return Rejection.of(Reason.PURE_ROTATION_OTHER_FOCAL, focal=float(turned.camera.focal))
 

@@ -17,8 +17,12 @@ from torchslam.config import Config
 from torchslam.geometry import SharedCamera
 from torchslam.geometry.lie import so3_log
 from torchslam.geometry.rolling_shutter import at_middle_row
-from torchslam.geometry.rotating_camera import RotatingCamera, fit_rotating_camera, rotation_between
-from torchslam.geometry.two_view import TRANSFER_WIDTH
+from torchslam.geometry.rotating_camera import (
+    MAX_FOCAL_SIGMAS,
+    RotatingCamera,
+    fit_rotating_camera,
+    rotation_between,
+)
 from torchslam.tracking.matcher import run_matcher
 from torchslam.types import FrameFeatures, Matcher
 
@@ -31,16 +35,9 @@ MAX_READOUT = 1.0
 """Longest readout of an image, in intervals between frames: no camera needs more time. Tried at this value only."""
 READOUT_SIGMAS = 3.0
 """Standard deviations from zero at which a readout time counts as measured. Tried at this value only."""
-MAX_FOCAL_SIGMAS = 3.0
-"""Largest departure from the focal length of the camera with which a rotation may explain the matches."""
-MAX_LOG_FOCAL = math.log(3.0)
-"""The same for a guess, and for any camera, as a logarithm: about the ratio of the focal lengths of usual lenses."""
-MAX_CONTRADICTING_RATIO = 0.05
-"""Ratio of the matches that may contradict a rotation with another focal length.
-
-Of rendered rotations it is 0.01 or less, with any guess of the focal length and either ORB. Where two frames of real
-sequences determine a map, it is 0.13 or more.
-"""
+MOST_FOCAL_STD = math.log(3.0) / MAX_FOCAL_SIGMAS
+"""Standard deviation of the logarithm of a guess of the focal length, and the largest of any camera: the largest
+departure is about the ratio of the focal lengths of usual lenses."""
 
 
 class TurningCamera:
@@ -50,9 +47,8 @@ class TurningCamera:
         self.camera, self.matcher = camera, matcher
         self.threshold_px = THRESHOLD_PX * config.features.reduction(camera.current.size)
         self.min_matches = config.initialization.min_matches
-        most = MAX_LOG_FOCAL / MAX_FOCAL_SIGMAS
         # Standard deviation of the logarithm of a focal length; zero if it is exact.
-        self.std = most if config.camera.guessed else min(config.camera.std, most)
+        self.std = MOST_FOCAL_STD if config.camera.guessed else min(config.camera.std, MOST_FOCAL_STD)
         self.seeks_readout = config.camera.readout_std > 0
         self._first: list[FrameFeatures] = []
         self._last: list[FrameFeatures] = []
@@ -90,14 +86,6 @@ class TurningCamera:
         if readout <= READOUT_SIGMAS * float(found.readout_std):
             return found, torch.zeros_like(turns)
         return found, min(readout, MAX_READOUT) * turns
-
-    def explains(self, turned: RotatingCamera, inliers: Bool[Tensor, " M"], noise_px: float) -> bool:
-        """Whether a rotation explains matches that are known to so many pixels."""
-        if float(turned.departure) > MAX_FOCAL_SIGMAS:
-            return False
-        # Errors in two dimensions, with the noise of both views.
-        off = turned.errors_px[0, inliers] > math.sqrt(2) * TRANSFER_WIDTH * noise_px
-        return float(off.double().mean()) <= MAX_CONTRADICTING_RATIO
 
     def at_middle_rows(
         self, pixels: tuple[Float[Tensor, "M 2"], Float[Tensor, "M 2"]], turns: Float[Tensor, "2 3"]
