@@ -125,7 +125,7 @@ def match_guided(
     """
     view_1, view_2 = matcher.views[one], matcher.views[other]
     limit_px = EPIPOLAR_PX * matcher.threshold_px / THRESHOLD_PX
-    if not isinstance(matcher.matcher, DescriptorMatcher) or not view_1.descriptors.is_floating_point():
+    if type(matcher.matcher) is not DescriptorMatcher or not view_1.descriptors.is_floating_point():
         prior = MatchPrior(T_21=T_21, camera=camera, epipolar_px=limit_px)
         return run_matcher(matcher.matcher, view_1, view_2, prior)
     near = near_epipolar_line(view_1, view_2, T_21, camera, limit_px)

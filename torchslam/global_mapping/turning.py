@@ -60,7 +60,9 @@ def _matches(
     mask = torch.zeros(len(pairs), size, dtype=torch.bool, device=pixels.device)
     for row, pair in enumerate(pairs):
         count = min(size, len(pair))
-        rows = torch.linspace(0, len(pair) - 1, count, device=pixels.device).round().long()
+        rows = (
+            torch.linspace(0, len(pair) - 1, count, dtype=pixels.dtype, device=pixels.device).round().long()
+        )
         pixels[0, row, :count] = views[pair.first].keypoints[pair.keypoints_1[rows]]
         pixels[1, row, :count] = views[pair.second].keypoints[pair.keypoints_2[rows]]
         mask[row, :count] = True

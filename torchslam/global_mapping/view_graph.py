@@ -127,7 +127,7 @@ class PairMatcher:
             near: which of some rows and columns, (R, C), its matches may join; None: all.
         """
         view_1, view_2 = self.views[one], self.views[other]
-        if not isinstance(self.matcher, DescriptorMatcher) or (self._directions is None and near is None):
+        if type(self.matcher) is not DescriptorMatcher or (self._directions is None and near is None):
             return run_matcher(self.matcher, view_1, view_2)
         settings = self.matcher.settings
         ratio = None if settings.max_ratio is None else laxer * settings.max_ratio
@@ -144,7 +144,7 @@ class PairMatcher:
     @cached_property
     def _directions(self) -> Directions | None:
         """Those by which torchslam's own matcher chooses, of images spread over all; None: it does not."""
-        if not isinstance(self.matcher, DescriptorMatcher):
+        if type(self.matcher) is not DescriptorMatcher:
             return None
         chosen = self.views[:: -(-len(self.views) // _DIRECTIONS_OF)]
         return Directions.of_images([view.descriptors for view in chosen], [view.mask for view in chosen])
