@@ -48,9 +48,9 @@ _PAIRS_AT_ONCE, _MIN_SAMPLES, _MAX_SAMPLES = 32, 64, 500
 Tried at these values only."""
 _DIRECTIONS_OF = 16
 """Most images whose descriptors determine the directions in which they differ. Tried at this value only."""
-_SORTED_AT_ONCE = 48
-"""Sorted descriptors of images that are kept, .5 KB for each keypoint. Images further apart are sorted again, which
-takes a tenth of the time of a match."""
+_SORTED_AT_ONCE = 16
+"""Sorted descriptors of images that are kept, 1 KB for each keypoint: near neighbors are among them. Images further
+apart are sorted again, which takes a tenth of the time of a match."""
 _SAMPLE = 5
 """Matches in a sample, which determine an essential matrix."""
 

@@ -99,7 +99,7 @@ def test_columns_outside_the_band_are_not_compared(monkeypatch: pytest.MonkeyPat
     found = cosine.nearest_of_sorted(one, other, 0.02, near)
     assert int(found.found.sum()) > 290
     assert torch.equal(torch.cat([rows for rows, _ in asked]), one.row)
-    width = 2.5 * (2 * 0.02 / 128) ** 0.5
+    width = 3.2 * (2 * 0.02 / 128) ** 0.5
     place = {int(row): at for at, row in enumerate(other.row)}
     for start, (rows, columns) in zip(range(0, 300, 50), asked, strict=True):
         ends = float(one.first[start]) - width, float(one.first[start + len(rows) - 1]) + width
