@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+from typing import Any
+from unittest.mock import MagicMock
+
 import pytest
 import torch
 from torch import Tensor
 
 from torchslam.global_mapping import frames_between
 from torchslam.global_mapping.frames_between import CELL_PX, FollowedViews, Still, Template, gray_of, spread
-from torchslam.types import Frame, FrameFeatures
+from torchslam.types import Explanation, Frame, FrameFeatures, Reason, State
 
 HEIGHT, WIDTH = 120, 160
 WAVES = 0.15 * torch.randn(24, 2, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
@@ -172,3 +176,56 @@ def test_at_most_so_many_are_followed(monkeypatch: pytest.MonkeyPatch) -> None:
     kept = torch.tensor([True, False, True, True, True])
     template = Template.of(view, gray_of(picture((0, 0)), 1.0), kept, 1.0)
     assert template.view.keypoints.tolist() == PIXELS[[0, 2, 3]].tolist()
+
+
+def estimate(inliers: int, is_doubtful: bool) -> SimpleNamespace:
+    return SimpleNamespace(
+        inliers=inliers, is_doubtful=is_doubtful, matches=99, T_cw=torch.eye(4), covariance=torch.eye(6)
+    )
+
+
+@pytest.mark.parametrize(
+    ("tried", "chosen", "state"),
+    [
+        ([(30, False), (90, False), (90, False)], 0, State.TRACKING),
+        ([(30, True), (20, False), (90, False)], 1, State.TRACKING),
+        ([(30, True), (90, True), (20, False)], 2, State.TRACKING),
+        ([(30, True), (90, True), (60, True)], 1, State.UNCERTAIN),
+        ([(30, True), (20, True), (60, True)], 2, State.UNCERTAIN),
+    ],
+)
+def test_the_first_pose_that_is_not_doubtful_is_taken(
+    monkeypatch: pytest.MonkeyPatch, tried: list[tuple[int, bool]], chosen: int, state: State
+) -> None:
+    """Of what was followed, the frame's own features and its relocalization; nothing is tried after it."""
+    views = [keyframe(7, PIXELS[:1]) for _ in tried]
+    poses, asked = [estimate(*each) for each in tried], list[int]()
+
+    def estimates(*_: object) -> Any:
+        for row, (view, pose) in enumerate(zip(views, poses, strict=True)):
+            asked.append(row)
+            yield view, pose, row < 2
+
+    doubt = Explanation.of(Reason.OTHER, text="doubtful")
+    monkeypatch.setattr(frames_between, "_estimates", estimates)
+    monkeypatch.setattr(frames_between, "_doubt", lambda _, pose: doubt if pose.is_doubtful else None)
+    tracker, submap = MagicMock(), MagicMock()
+    found = frames_between._track(tracker, submap, views[0], None)
+    assert (found.inliers, found.state) == (tried[chosen][0], state)
+    assert found.reasons == ((doubt,) if state is State.UNCERTAIN else ())
+    assert asked == list(range(chosen + 1 if state is State.TRACKING else 3))
+    (committed,) = tracker.commit.call_args_list
+    assert committed.args[1] is views[chosen]
+    assert committed.args[2] is (poses[chosen] if chosen < 2 else None)
+    assert tracker.start_at_estimate.called == (chosen == 2)
+    assert submap.posed_frames.add.call_args.args[:2] == (views[chosen], poses[chosen])
+
+
+def test_a_frame_without_any_pose_is_lost(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(frames_between, "_estimates", lambda *_: iter(()))
+    tracker, submap = MagicMock(), MagicMock()
+    found = frames_between._track(tracker, submap, keyframe(7, PIXELS[:1]), None)
+    assert found.state is State.LOST
+    assert [each.reason for each in found.reasons] == [Reason.NOT_FOUND]
+    assert tracker.commit.call_args.args[2] is None
+    assert not submap.posed_frames.add.called

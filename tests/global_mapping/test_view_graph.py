@@ -37,7 +37,7 @@ from torchslam.global_mapping.view_graph import (
     most_samples,
     similar_places,
 )
-from torchslam.tracking.matcher import make_matcher
+from torchslam.tracking.matcher import DescriptorMatcher, make_matcher, run_matcher
 from torchslam.types import FrameFeatures, Matches, MatchPrior
 
 CONFIG = load_config(None, ["matching.max_cosine_distance=0.3"])
@@ -50,7 +50,57 @@ def matcher_of(recording: Recording, config: Config = CONFIG) -> PairMatcher:
     return PairMatcher(recording.views, CAMERA, make_matcher(config.matching), config)
 
 
+def with_main_directions(recording: Recording, rank: int = 12) -> Recording:
+    """The same with descriptors that differ in few directions, about a common mean."""
+    basis = torch.randn(64, 64, generator=torch.Generator().manual_seed(9))[:rank]
+    views = []
+    for view in recording.views:
+        along = 1.0 + view.descriptors[:, :rank] @ basis
+        views.append(replace(view, descriptors=torch.nn.functional.normalize(along, dim=-1)))
+    return replace(recording, views=views)
+
+
 # --- matching and verification ---------------------------------------------------------------------------------
+
+
+def test_sorted_descriptors_match_as_all_against_all(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also where images are sorted again, and with pairs of keypoints that may not match."""
+    recording = with_main_directions(RECORDING)
+    matcher = matcher_of(recording)
+    assert matcher._directions is not None
+    assert matcher_of(RECORDING)._directions is None
+    monkeypatch.setattr(view_graph, "_SORTED_AT_ONCE", 2)
+    for one, other in [(0, 1), (1, 2), (0, 2), (2, 3), (0, 3)]:
+        found = matcher.match_two(one, other)
+        exact = run_matcher(matcher.matcher, recording.views[one], recording.views[other])
+        ours, true = (
+            set(zip(each.first.tolist(), each.second.tolist(), strict=True)) for each in (found, exact)
+        )
+        assert len(true) > 50
+        assert len(ours ^ true) <= 0.05 * len(true)
+        assert len(matcher._sorted) <= 2
+        kept = matcher.match_two(
+            one, other, 1.25, lambda rows, columns: (rows % 2 == 0)[:, None] & (columns >= 0)
+        )
+        assert bool((kept.first % 2 == 0).all())
+        even = {ends for ends in ours if ends[0] % 2 == 0}
+        assert even <= set(zip(kept.first.tolist(), kept.second.tolist(), strict=True))
+
+
+def test_a_matcher_of_a_user_is_called() -> None:
+    """One that extends torchslam's as well, where descriptors could be sorted."""
+    asked: list[tuple[int, int]] = []
+
+    class Mine(DescriptorMatcher):
+        def __call__(
+            self, view_1: FrameFeatures, view_2: FrameFeatures, prior: MatchPrior | None = None
+        ) -> Matches:
+            asked.append((view_1.index, view_2.index))
+            return super().__call__(view_1, view_2, prior)
+
+    views = with_main_directions(RECORDING).views
+    PairMatcher(views, CAMERA, Mine(CONFIG.matching), CONFIG).match_two(0, 1)
+    assert asked == [(views[0].index, views[1].index)]
 
 
 def test_the_relative_pose_and_the_right_matches_of_a_pair_are_found() -> None:

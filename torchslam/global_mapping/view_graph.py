@@ -229,7 +229,7 @@ def build_view_graph(
     """
     find = partial(match, matcher) if match else matcher.match
     count = len(matcher.views)
-    far = [FAR << doubled for doubled in range(count) if FAR << doubled < count]
+    far = [FAR << doubled for doubled in range(count.bit_length()) if FAR << doubled < count]
     groups = range(0, count, _IMAGES_AT_ONCE)
     steps = len(groups) + len(far) + 1
     pairs: list[ViewPair] = []
