@@ -60,7 +60,7 @@ class RotatingCamera:
     errors_px: Float[Tensor, "B N"]
 
     def explains(self, mask: Bool[Tensor, "B N"], noise_px: float) -> Bool[Tensor, " B"]:
-        """Whether the rotation explains those matches that are known to so many pixels."""
+        """Whether the rotation explains the matches of a mask, which are known to `noise_px`."""
         # Errors in two dimensions, with the noise of both views.
         off = (self.errors_px > math.sqrt(2) * TRANSFER_WIDTH * noise_px) & mask
         is_near = off.sum(-1) <= MAX_CONTRADICTING_RATIO * mask.sum(-1)

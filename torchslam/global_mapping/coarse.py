@@ -23,7 +23,7 @@ from torchslam.global_mapping.rounds import (
     adjust_coarsely,
 )
 from torchslam.global_mapping.turning import turning_focal
-from torchslam.global_mapping.view_graph import THRESHOLD_PX, Relation, ViewPair, connected_views
+from torchslam.global_mapping.view_graph import Relation, ViewPair, connected_views
 from torchslam.global_mapping.windows import KnownPoses, rotations_hold
 from torchslam.optim import ROTATION_OPTIONS
 from torchslam.optim.rotation_averaging import solve_rotations
@@ -57,7 +57,7 @@ class CoarseMap(NamedTuple):
     unposed: list[ViewPair]
 
 
-def silent(stage: str, done: int, most: int) -> None:
+def _silent(stage: str, done: int, most: int) -> None:
     pass
 
 
@@ -68,14 +68,14 @@ class CoarseMapper:
     Attributes:
         camera: of all images.
         given: the camera with its error; None: it is exact.
-        progress: receives stages.
         threshold_px: distance from the epipolar line up to which matches were verified.
+        progress: receives stages.
     """
 
     camera: Camera
     given: CameraMeasurement | None
-    progress: Callable[[str, int, int], None] = silent
-    threshold_px: float = THRESHOLD_PX
+    threshold_px: float
+    progress: Callable[[str, int, int], None] = _silent
 
     def map(
         self, views: list[FrameFeatures], pairs: list[ViewPair], learned: list[ViewPair]

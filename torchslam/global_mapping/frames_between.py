@@ -256,11 +256,12 @@ def _track(
     doubtful; else the pose with most inliers is taken.
     """
     best: tuple[FrameFeatures, PoseEstimate, bool] | None = None
+    doubt: Rejection | None = None
     for found in _estimates(tracker, submap, view, again):
-        is_sure = _doubt(submap, found[1]) is None
-        if best is None or is_sure or found[1].inliers > best[1].inliers:
-            best = found
-        if is_sure:
+        reason = _doubt(submap, found[1])
+        if best is None or reason is None or found[1].inliers > best[1].inliers:
+            best, doubt = found, reason
+        if reason is None:
             break
     if best is None:
         tracker.commit(submap, view, None)
@@ -270,18 +271,17 @@ def _track(
     tracker.commit(submap, view, estimate if is_tracked else None)
     if not is_tracked:
         tracker.start_at_estimate(submap, view, estimate)
-    rejection = _doubt(submap, estimate)
     submap.posed_frames.add(view, estimate, submap.tracking.T_cr, submap.tracking.reference)
     return StepResult(
         view.index,
         view.timestamp,
-        State.UNCERTAIN if rejection else State.TRACKING,
+        State.UNCERTAIN if doubt else State.TRACKING,
         estimate.T_cw.clone(),
         submap.number,
         covariance=estimate.covariance,
         matches=estimate.matches,
         inliers=estimate.inliers,
-        reasons=(rejection,) if rejection else (),
+        reasons=(doubt,) if doubt else (),
     )
 
 

@@ -21,7 +21,7 @@ from torchslam.geometry import Camera, SensorModel
 from torchslam.geometry.camera_measurement import CameraMeasurement
 from torchslam.geometry.rolling_shutter import Readout
 from torchslam.global_mapping.check import MapCheck, check_map
-from torchslam.global_mapping.coarse import CoarseMap, CoarseMapper, silent
+from torchslam.global_mapping.coarse import CoarseMap, CoarseMapper
 from torchslam.global_mapping.frames_between import FollowedViews, pose_frames
 from torchslam.global_mapping.links import (
     MIN_LEARNED_MATCHES,
@@ -340,7 +340,7 @@ class GlobalMapper:
         if learned is not None:
             views, more = learned
         windows = split(len(views), self.config.global_mapping.window_images)
-        coarse = CoarseMapper(self.camera, self.given, self.progress, matcher.threshold_px)
+        coarse = CoarseMapper(self.camera, self.given, matcher.threshold_px, self.progress)
         begun = (
             coarse.map(views, pairs, more)
             if len(windows) == 1
@@ -379,7 +379,7 @@ class GlobalMapper:
             )
             for window in windows
         ]
-        parts = self.saved, replace(coarse, progress=silent)
+        parts = self.saved, CoarseMapper(self.camera, self.given, coarse.threshold_px)
         found = dict[int, MappedWindow | str]()
         with SharedTasks(map_window, parts, min(self._processes(), len(windows)), ahead=1) as shared:
             self.progress("windows", 0, len(windows))

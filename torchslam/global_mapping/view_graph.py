@@ -12,7 +12,7 @@ from enum import Enum
 from functools import cached_property, partial
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchslam.config import Config
@@ -88,6 +88,10 @@ class ViewPair:
         return len(self.keypoints_1)
 
 
+MatchedPair = tuple[int, int, Int[Tensor, " _"], Int[Tensor, " _"]]
+"""Rows of two images, and the keypoints of either that match."""
+
+
 class PairMatcher:
     """Matches pairs of images and verifies them by two-view geometry.
 
@@ -127,7 +131,7 @@ class PairMatcher:
             near: which of some rows and columns, (R, C), its matches may join; None: all.
         """
         view_1, view_2 = self.views[one], self.views[other]
-        if type(self.matcher) is not DescriptorMatcher or (self._directions is None and near is None):
+        if type(self.matcher) is not DescriptorMatcher:
             return run_matcher(self.matcher, view_1, view_2)
         settings = self.matcher.settings
         ratio = None if settings.max_ratio is None else laxer * settings.max_ratio
@@ -158,8 +162,8 @@ class PairMatcher:
             self._sorted[row] = self._directions.sort(self.views[row].descriptors, self.views[row].mask)
         return self._sorted[row]
 
-    def verify(self, found: list[tuple[int, int, Tensor, Tensor]]) -> list[ViewPair]:
-        """Verify matched pairs (first, second, keypoints of either)."""
+    def verify(self, found: list[MatchedPair]) -> list[ViewPair]:
+        """The matched pairs that hold, verified."""
         # Those with about as many matches together, so that little is padded.
         order = sorted(range(len(found)), key=lambda row: len(found[row][2]))
         held: dict[int, ViewPair] = {}
@@ -168,24 +172,18 @@ class PairMatcher:
             held |= {rows[at]: pair for at, pair in self._verified([found[row] for row in rows]).items()}
         return [held[row] for row in sorted(held)]
 
-    def _verified(self, found: list[tuple[int, int, Tensor, Tensor]]) -> dict[int, ViewPair]:
+    def _verified(self, found: list[MatchedPair]) -> dict[int, ViewPair]:
         """The pairs that hold, by their place in a batch."""
-        size = max(len(at_1) for _, _, at_1, _ in found)
-        pixels = self.camera.params.new_zeros(2, len(found), size, 2)
-        mask = torch.zeros(len(found), size, dtype=torch.bool, device=pixels.device)
-        for row, (one, other, at_1, at_2) in enumerate(found):
-            mask[row, : len(at_1)] = True
-            pixels[0, row, : len(at_1)] = self.views[one].keypoints[at_1]
-            pixels[1, row, : len(at_1)] = self.views[other].keypoints[at_2]
+        pixels_1, pixels_2, mask = padded_matches(self.views, found, self.camera.params)
         relative = estimate_relative_pose(
-            pixels[0],
-            pixels[1],
+            pixels_1,
+            pixels_2,
             camera_1=self.camera,
             camera_2=self.camera,
             threshold=self.threshold_px,
             mask=mask,
             seed=self.config.seed,
-            max_samples=most_samples(size),
+            max_samples=most_samples(mask.shape[1]),
             kernel="truncated",
             min_samples=_MIN_SAMPLES,
         )
@@ -198,6 +196,20 @@ class PairMatcher:
             relation = Relation.ROTATION if relative.model[row] == "rotation" else relation
             pairs[row] = ViewPair(one, other, at_1[inliers], at_2[inliers], relative.T_21[row], relation)
         return pairs
+
+
+def padded_matches(
+    views: list[FrameFeatures], found: list[MatchedPair], like: Tensor
+) -> tuple[Float[Tensor, "B N 2"], Float[Tensor, "B N 2"], Bool[Tensor, "B N"]]:
+    """The matching keypoints of pairs in as many rows each, of the type of `like`, and which rows are filled."""
+    size = max(len(at_1) for _, _, at_1, _ in found)
+    pixels = like.new_zeros(2, len(found), size, 2)
+    mask = torch.zeros(len(found), size, dtype=torch.bool, device=pixels.device)
+    for row, (one, other, at_1, at_2) in enumerate(found):
+        mask[row, : len(at_1)] = True
+        pixels[0, row, : len(at_1)] = views[one].keypoints[at_1]
+        pixels[1, row, : len(at_1)] = views[other].keypoints[at_2]
+    return pixels[0], pixels[1], mask
 
 
 def least_verified(matches: int) -> float:

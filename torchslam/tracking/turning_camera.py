@@ -36,8 +36,8 @@ MAX_READOUT = 1.0
 READOUT_SIGMAS = 3.0
 """Standard deviations from zero at which a readout time counts as measured. Tried at this value only."""
 MOST_FOCAL_STD = math.log(3.0) / MAX_FOCAL_SIGMAS
-"""Standard deviation of the logarithm of a guess of the focal length, and the largest of any camera: the largest
-departure is about the ratio of the focal lengths of usual lenses."""
+"""Standard deviation of the logarithm of a guessed focal length, and the largest for any camera. Three of them are a
+factor of three, about the ratio of the focal lengths of usual lenses."""
 
 
 class TurningCamera:

@@ -14,12 +14,7 @@ from jaxtyping import Bool, Float, Int, Shaped
 from torch import Tensor
 
 from torchslam.features.contract import NORMALIZE, are_unit_or_zero
-from torchslam.features.matching.cosine import (
-    SortedDescriptors,
-    dual_softmax,
-    nearest_by_cosine,
-    nearest_of_sorted,
-)
+from torchslam.features.matching.cosine import SortedDescriptors, nearest_by_cosine, nearest_of_sorted
 from torchslam.features.matching.hamming import hamming, hamming_between, nearest_by_hamming
 from torchslam.features.matching.nearest import NearestNeighbors
 from torchslam.geometry.precision import check_positive, without_autocast
@@ -82,7 +77,7 @@ def match(
     mask = _accepted(nearest, columns, ratio, mutual, max_distance)
     weights = None
     if temperature is not None and similarity is not None:
-        weights = dual_softmax(similarity / temperature, nearest.column, *masks) * mask
+        weights = _dual_softmax(similarity / temperature, nearest.column, *masks) * mask
     return to_matches(nearest.column, nearest.distance, mask, weights)
 
 
@@ -114,6 +109,21 @@ def _accepted(
     if mutual:
         mask = mask & nearest.mutual
     return one_to_one(nearest.column, nearest.distance.detach(), mask, columns)
+
+
+def _dual_softmax(
+    logits: Float[Tensor, "B N1 N2"],
+    column: Int[Tensor, "B N1"],
+    mask_1: Bool[Tensor, "B N1"],
+    mask_2: Bool[Tensor, "B N2"],
+    allowed: Bool[Tensor, "B N1 N2"] | None,
+) -> Float[Tensor, "B N1"]:
+    """Compute the product of the softmax over columns and over rows at (row, column[row])."""
+    low = torch.finfo(logits.dtype).min / 2
+    possible = mask_1[:, :, None] & mask_2[:, None, :]
+    logits = logits.masked_fill(~(possible if allowed is None else possible & allowed), low)
+    both = logits.softmax(2) * logits.softmax(1)
+    return both.gather(2, column[..., None])[..., 0]
 
 
 @without_autocast

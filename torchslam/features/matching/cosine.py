@@ -1,8 +1,8 @@
 """Nearest neighbors of descriptors of floats by cosine.
 
-Most of the variance of descriptors lies in few directions. Where there are many descriptors, those of an image are
-sorted along the first of these, each is compared with the others' that are near along it, by the coordinates along all
-of these, and the distances to what is chosen are exact.
+Most of the variance of descriptors lies in few directions. Where there are many descriptors, those of each image are
+sorted along the first direction. Each is compared, by its coordinates along all of these directions, only with those of
+the other image that are near it along the first one. The distances to what is chosen are exact.
 """
 
 from __future__ import annotations
@@ -15,7 +15,13 @@ import torch
 from jaxtyping import Bool, Float, Int, Shaped
 from torch import Tensor
 
-from torchslam.features.matching.nearest import INDEX_BITS, Candidates, NearestNeighbors, column_of
+from torchslam.features.matching.nearest import (
+    INDEX_BITS,
+    Candidates,
+    NearestNeighbors,
+    best_keys,
+    column_of,
+)
 
 _ROWS_AT_ONCE = 512
 """Rows whose similarities are computed at once: they stay in the cache. 256 to 1024 are equally fast, all 2000 of an
@@ -24,13 +30,13 @@ _SORTED_AT_ONCE = 256
 """The same for sorted rows: the more there are, the wider is the band of columns. 128 is as fast."""
 _DIRECTIONS, _VARIANCE = 0.5, 0.9
 """Share of the dimensions of descriptors by which columns are chosen, and what they must hold of the variance: 64 of
-SIFT's 128 hold .96. With 48 dimensions, 1.4 % of the matches of garden, courthouse and machine_hall pass that would
-not, in place of .6 %, in four fifths of the time."""
+SIFT's 128 hold .96. With 48 dimensions, by the directions of two images, 1.4 % of the matches of garden, courthouse and
+machine_hall pass that would not, in place of .6 %, in four fifths of the time."""
 _BAND = 3.2
 """Half of the width of the band of columns that are compared, in root mean squares of a coordinate of the largest
 difference of two descriptors that match. Of the matches that pass mutual and ratio test on garden, courthouse,
-office_loop and machine_hall, .4 to .9 % are lost and .5 to 1.1 % are new, as by _DIRECTIONS without a band, in .75 of
-the time. With 2.5, .7 to 1.6 % are new, in .65 of the time. Tried 1.6 to 4."""
+office_loop and machine_hall, .4 to .9 % are lost and .5 to 1.1 % are new, as by _DIRECTIONS without a band, in .75 to
+.85 of the time. With 2.5, .7 to 1.6 % are new, in .65 to .85 of the time. Tried 1.6 to 4."""
 _SAMPLE = 512
 """Descriptors of each set, the strongest, from which directions are found. Tried at this value only."""
 _DIRECTIONS_FROM = 1 << 20
@@ -139,13 +145,14 @@ def nearest_by_cosine(
         similarity = used_2.new_empty(len(mask_2), min(_ROWS_AT_ONCE, pairs.rows), pairs.columns)
 
     def keys_of(chunk: slice) -> tuple[Tensor, slice]:
-        every = slice(0, pairs.columns)
         if with_gradient:
-            return similarity.detach()[:, chunk].clone(), every
+            return pairs.only(similarity.detach()[:, chunk].clone(), chunk, -torch.inf)
         room = similarity[:, : chunk.stop - chunk.start]
-        return torch.matmul(used_1[:, chunk], used_2.mT, out=room), every
+        return pairs.only(torch.matmul(used_1[:, chunk], used_2.mT, out=room), chunk, -torch.inf)
 
-    best, column, second, of_column = pairs.best(keys_of, -torch.inf, _ROWS_AT_ONCE, 0, with_second)
+    best, column, second, of_column = best_keys(
+        keys_of, pairs.rows, pairs.columns, -torch.inf, _ROWS_AT_ONCE, 0, with_second
+    )
     found = best > -torch.inf
     nearest = 1 - (similarity.gather(2, column[..., None])[..., 0] if with_gradient else best)
     nearest = torch.where(found, nearest, 1.0)
@@ -209,8 +216,7 @@ def nearest_of_sorted(
             keys.masked_fill_(~allowed(one.row[chunk], other.row[at]), lowest)
         return keys[None], at
 
-    pairs = Candidates(None, None, None, rows, columns)
-    found = pairs.best(keys_of, lowest, _SORTED_AT_ONCE, index_bits, True)
+    found = best_keys(keys_of, rows, columns, lowest, _SORTED_AT_ONCE, index_bits, True)
     best, column, second, of_column = (values[0] for values in found)
     mutual = (best > lowest) & (best >> index_bits >= of_column >> index_bits)
     own = torch.nonzero(mutual)[:, 0]
@@ -234,18 +240,3 @@ def _used(mask: Bool[Tensor, "B N"]) -> int:
     """Number of rows up to the last one that some element uses, at least one: feature extractors pad at the end."""
     used = torch.nonzero(mask.any(0))
     return int(used[-1]) + 1 if len(used) else 1
-
-
-def dual_softmax(
-    logits: Float[Tensor, "B N1 N2"],
-    column: Int[Tensor, "B N1"],
-    mask_1: Bool[Tensor, "B N1"],
-    mask_2: Bool[Tensor, "B N2"],
-    allowed: Bool[Tensor, "B N1 N2"] | None,
-) -> Float[Tensor, "B N1"]:
-    """Compute the product of the softmax over columns and over rows at (row, column[row])."""
-    low = torch.finfo(logits.dtype).min / 2
-    possible = mask_1[:, :, None] & mask_2[:, None, :]
-    logits = logits.masked_fill(~(possible if allowed is None else possible & allowed), low)
-    both = logits.softmax(2) * logits.softmax(1)
-    return both.gather(2, column[..., None])[..., 0]

@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Bool, Int, Integer, Num, Shaped, UInt8
 from torch import Tensor
 
-from torchslam.features.matching.nearest import INDEX_BITS, Candidates, NearestNeighbors
+from torchslam.features.matching.nearest import INDEX_BITS, Candidates, NearestNeighbors, best_keys
 from torchslam.geometry.precision import without_autocast
 from torchslam.utils.torch_internals import int8_matmul
 
@@ -160,9 +160,9 @@ def nearest_by_hamming(
     def distance(key: Tensor) -> Tensor:
         return torch.where(key > lowest, (bits // 2 - (key.to(torch.int64) >> index_bits)).float(), torch.inf)
 
-    pairs, every = Candidates(mask_1, mask_2, allowed, rows, columns), slice(0, columns)
-    best, column, second, of_column = pairs.best(
-        lambda _: (keys, every), lowest, rows, index_bits, with_second
+    pairs = Candidates(mask_1, mask_2, allowed, rows, columns)
+    best, column, second, of_column = best_keys(
+        lambda chunk: pairs.only(keys, chunk, lowest), rows, columns, lowest, rows, index_bits, with_second
     )
     mutual = distance(best) <= distance(of_column)
     return pairs.neighbors(
