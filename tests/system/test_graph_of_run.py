@@ -182,7 +182,7 @@ def test_in_a_small_map_adjustment_is_applied_before_the_next_frame(monkeypatch:
         begun.clear()
         with monkeypatch.context() as patched:
             if is_at_once:
-                patched.setattr(StateMachine, "_apply_at", lambda _: ApplyAt.NOW)
+                patched.setattr(StateMachine, "_apply_at", lambda *_: ApplyAt.NOW)
             runs.append(run_walk(walk))
         assert len(begun) > 6
         assert set(begun) == {None}  # no frame is tracked before

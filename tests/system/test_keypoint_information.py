@@ -45,7 +45,7 @@ Say = Callable[[Features], Tensor | None]
 @pytest.fixture(autouse=True)
 def adjusted_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
     """Young or not, a submap grows alike."""
-    monkeypatch.setattr(StateMachine, "_apply_at", lambda _: ApplyAt.NOW)
+    monkeypatch.setattr(StateMachine, "_apply_at", lambda *_: ApplyAt.NOW)
 
 
 def by_number(features: Features) -> Tensor:

@@ -17,7 +17,9 @@ from torchslam.map.atlas import Submap
 from torchslam.map.compaction import RowRemap
 from torchslam.map.map import Map
 from torchslam.mapping.local_bundle import ApplyAt
+from torchslam.system import local_mapping, state_machine
 from torchslam.system.maintenance import LOOP_STRIDE, Maintenance
+from torchslam.system.modes import Mode
 from torchslam.system.savepoint import Savepoint
 from torchslam.system.state_machine import StateMachine
 
@@ -189,7 +191,7 @@ def test_in_a_run_the_map_is_maintained_in_the_same_order(
 ) -> None:
     """Rows may only be renumbered once nothing is pending."""
     if not is_delayed:
-        monkeypatch.setattr(StateMachine, "_apply_at", lambda _: ApplyAt.NOW)
+        monkeypatch.setattr(StateMachine, "_apply_at", lambda *_: ApplyAt.NOW)
     drive = Drive(monkeypatch, Walk(arc(80, 6.0)[:40]), "loop_closing.enabled=true")
     calls: list[str] = []
 
@@ -211,3 +213,59 @@ def test_in_a_run_the_map_is_maintained_in_the_same_order(
     following = dict(pairwise([*STEPS, STEPS[0]]))
     assert all(following[one] == other for one, other in pairwise(calls)), calls
     assert calls.count("cull") >= 6
+
+
+WHOLE_FRAMES = 12  # after which the adjustment of the whole map is due
+
+
+def with_whole_adjustment(monkeypatch: pytest.MonkeyPatch, few: int) -> tuple[Drive, list[int]]:
+    """A walk with an adjustment of the whole map pending, and the frame in which it is applied, once it is.
+
+    few: points in view below which no keyframe waits for it
+    """
+    for module in (local_mapping, state_machine):
+        monkeypatch.setattr(module, "MIN_POINTS", few)
+    monkeypatch.setattr(local_mapping, "LIVE_MIN_OVERLAP", 0.0)
+    drive, applied = Drive(monkeypatch, Walk(arc(80, 6.0)[:60])), list[int]()
+    slam, adjustment = drive.slam, drive.slam.mapper.adjustment
+    while drive.step() is not Mode.TRACKING or adjustment.is_pending:
+        pass
+    assert slam.submap is not None
+    due = len(drive.results) + WHOLE_FRAMES - 1
+    adjustment.request_whole(
+        slam.submap.map, slam.camera, due, lambda: applied.append(len(drive.results) + 1)
+    )
+    return drive, applied
+
+
+def test_keyframes_wait_for_an_adjustment_of_the_whole_map(monkeypatch: pytest.MonkeyPatch) -> None:
+    drive, applied = with_whole_adjustment(monkeypatch, few=0)
+    begun = len(drive.results)
+    while not applied:
+        drive.step()
+    assert applied == [begun + WHOLE_FRAMES]
+    assert not any(result.is_keyframe for result in drive.results[begun:])
+
+
+def test_with_few_points_in_view_a_keyframe_does_not_wait(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The adjustment is applied, and that of the keyframe is due before the next frame."""
+    drive, applied = with_whole_adjustment(monkeypatch, few=1000)
+    begun = len(drive.results)
+    while not applied:
+        drive.step()
+    assert applied[0] < begun + WHOLE_FRAMES
+    assert [result.is_keyframe for result in drive.results[begun:]] == [False] * (applied[0] - begun - 1) + [
+        True
+    ]
+    assert drive.slam.mapper.adjustment.is_due_before_next_frame
+    drive.check()
+
+
+def test_a_frame_that_is_not_found_in_the_adjusted_map_is_lost(monkeypatch: pytest.MonkeyPatch) -> None:
+    drive, applied = with_whole_adjustment(monkeypatch, few=1000)
+    tracker = drive.slam._context.tracker
+    track = tracker.track
+    monkeypatch.setattr(tracker, "track", lambda *given: None if applied else track(*given))
+    drive.until(Mode.LOST)
+    assert applied == [len(drive.results)]
+    drive.check()

@@ -293,6 +293,19 @@ def test_a_checkpoint_has_the_estimate_that_is_pending(tmp_path: Path) -> None:
         assert torch.equal(one[1].sensor.camera.params, other[1].sensor.camera.params)
 
 
+def test_an_estimate_is_made_once_although_checkpoints_ask_for_it() -> None:
+    slam = SLAM(given(OFF), config())
+    calls = Calls(slam)
+    with slam.online_camera.solved_by(calls):
+        for frame in seen():
+            slam.step(frame)
+            if slam.online_camera.is_pending:
+                break
+        assert slam.online_camera.pending is not None
+        assert slam.online_camera.pending[1] is slam.online_camera.pending[1]
+    assert len(calls.taken) == 1
+
+
 def test_no_checkpoint_while_the_whole_map_is_adjusted(watched: tuple[Run, Calls, int]) -> None:
     assert watched[2] > 0
 

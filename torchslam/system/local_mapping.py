@@ -6,7 +6,13 @@ from torchslam.config import KeyframesConfig
 from torchslam.loop_closing.loop_closer import LoopCloser
 from torchslam.map.atlas import Submap
 from torchslam.mapping.local_bundle import ApplyAt
-from torchslam.mapping.mapper import LIVE_MIN_OVERLAP, Mapper, keyframe_reason, overlap_with_reference
+from torchslam.mapping.mapper import (
+    LIVE_MIN_OVERLAP,
+    MIN_POINTS,
+    Mapper,
+    keyframe_reason,
+    overlap_with_reference,
+)
 from torchslam.system.frame_log import FrameLog, HeldFrame
 from torchslam.system.savepoint import Savepoint
 from torchslam.tracking.pose_validation import NUM_CONFIRMING_FRAMES, Certainty, Verdict, check_pose
@@ -47,7 +53,7 @@ class LocalMapping:
         """Add a frame with a certain pose; return why it became a keyframe, or None.
 
         While an adjustment is pending there is no other keyframe: it is applied after this frame instead. That of the
-        whole map takes longer: it is waited for as long as enough of the map is seen.
+        whole map takes longer: it is waited for as long as enough of the map is seen, see `is_urgent`.
         """
         self.tracker.count_visible(submap.map, estimate)
         reason = self._keyframe_reason(submap, view, estimate)
@@ -63,6 +69,11 @@ class LocalMapping:
         if reason and sensor.readout is not None:
             submap.correct_keyframes(sensor, newest=2)  # the frame after the one before is known now
         return reason
+
+    def is_urgent(self, submap: Submap, view: FrameFeatures, estimate: PoseEstimate) -> bool:
+        """Whether a keyframe is due at once, before the pending adjustment of the whole map: few points are in view."""
+        is_weak = self.adjustment.is_whole and estimate.inliers < MIN_POINTS
+        return is_weak and self._keyframe_reason(submap, view, estimate) is not None
 
     def add_tentative_keyframe(
         self, savepoint: Savepoint, view: FrameFeatures, estimate: PoseEstimate

@@ -12,7 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cache, partial
 
 from torchslam.config import CameraConfig, Config
 from torchslam.geometry import Camera, SensorModel, SharedCamera
@@ -146,7 +146,7 @@ class OnlineCamera(SolvedElsewhere):
         self.next_check = math.ceil(keyframes * GROWTH)
         graph = submap.posed_frames.graph(submap.map, self.camera.model)
         options = MAP_OPTIONS.replace(iterations=GLOBAL_ITERATIONS, tolerance=TOLERANCE)
-        result = self.solver(estimate_sensor, graph, self.prior, options, ONLINE_FRAMES)
+        result = cache(self.solver(estimate_sensor, graph, self.prior, options, ONLINE_FRAMES))
         self._pending = _Estimate(
             submap, frame + max(ESTIMATE_FRAMES, int(ESTIMATE_RATIO * keyframes)), result
         )

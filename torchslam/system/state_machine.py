@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 
 from torchslam.map.atlas import Submap
 from torchslam.mapping.local_bundle import LOCAL_WINDOW, ApplyAt
-from torchslam.mapping.mapper import remove_masked_observations
+from torchslam.mapping.mapper import MIN_POINTS, remove_masked_observations
 from torchslam.system.local_mapping import BackwardTracking, LocalMapping, locate
 from torchslam.system.maintenance import Maintenance
 from torchslam.system.map_start import MapStart
@@ -24,7 +24,7 @@ from torchslam.system.session import SystemContext
 from torchslam.tracking.non_static import NO_MOVEMENT, FilteredView
 from torchslam.tracking.pose_validation import NUM_CONFIRMING_FRAMES, SURE_INLIERS, Certainty, Verdict
 from torchslam.tracking.tracker import Relocalizer
-from torchslam.types import Explanation, FrameFeatures, PoseEstimate, Reason
+from torchslam.types import Explanation, FrameFeatures, PoseEstimate, PosePrediction, Reason
 
 FRAMES_BEFORE_NEW_SUBMAP = 20
 """Lost frames before a new submap may be initialized, so that the camera can come back. Tried at this value only."""
@@ -129,7 +129,14 @@ class StateMachine:
             motion: Note about keypoints that move independently of the scene.
         """
         context, view, active_map = self.context, filtered.view, self.active_map
-        reason = self.mapping.add_frame(active_map.current, view, estimate, self._apply_at())
+        if self.mapping.is_urgent(active_map.current, view, estimate):
+            self.maintenance.after_frame(None)
+            view = self._at_middle_row(active_map.current, filtered).view
+            again = context.tracker.track(active_map.current, view, PosePrediction(active_map.current.T_cw))
+            if again is None:
+                return self._lose(view)
+            estimate = again
+        reason = self.mapping.add_frame(active_map.current, view, estimate, self._apply_at(estimate))
         has_new_overlay = context.session.mapping and context.scene_filter.update_overlay(
             filtered, active_map.current.T_cw, estimate.depth, active_map.current.world
         )
@@ -144,10 +151,14 @@ class StateMachine:
         reasons = [note for note in notes if note is not None]
         return FrameOutcome(reasons, active_map.submap, estimate, reason is not None)
 
-    def _apply_at(self) -> ApplyAt:
-        """When the adjustment around a new keyframe is applied: soon, as long as it moves the whole map."""
+    def _apply_at(self, estimate: PoseEstimate) -> ApplyAt:
+        """When the adjustment around a new keyframe is applied.
+
+        Soon, as long as it moves the whole map, or where so few points are in view that the next frame may have to be a
+        keyframe as well.
+        """
         is_small = self.active_map.current.map.num_keyframes < LOCAL_WINDOW
-        if is_small or self.active_map.provisional is not None:
+        if is_small or self.active_map.provisional is not None or estimate.inliers < MIN_POINTS:
             return ApplyAt.BEFORE_NEXT_FRAME
         return ApplyAt.AFTER_DELAY
 
