@@ -35,7 +35,7 @@ MIN_FOUND_RATIO = 0.25
 """Ratio of the frames that found a point to those in which it was visible: ORB-SLAM's. Tried at this value only."""
 MIN_POINTS = 80
 """Tracked points below which a frame becomes a keyframe, since they will soon be too few, and below which no keyframe
-waits for an adjustment of the whole map. Where they wait, 7 of 20 seeds of office_loop are lost at a turn, here none.
+waits for an adjustment of the whole map. Where they wait, 7 of 20 seeds of office_loop are lost at a turn, here one.
 Tried at this value only."""
 RECENT_KEYFRAMES = 3
 """Number of keyframes after its first one for which a point may be culled."""
