@@ -13,6 +13,7 @@ from torch import Tensor
 from tests.global_mapping.synthetic import CAMERA, Recording, disturbed, line, wall
 from torchslam.config import Config
 from torchslam.geometry import se3_inverse
+from torchslam.global_mapping.baselines import ViewRays
 from torchslam.global_mapping.links import (
     ACROSS,
     match_guided,
@@ -101,7 +102,7 @@ def test_repetitive_structure_is_matched_by_the_poses() -> None:
     matcher = matcher_of(recording)
     free = matcher.match([(4, 5)])
     T_21 = recording.T_cw[5] @ se3_inverse(recording.T_cw[4])
-    found = match_guided(matcher, 4, 5, T_21, CAMERA)
+    found = match_guided(matcher, 4, 5, T_21, ViewRays(CAMERA, recording.views))
     right = recording.shows[4][found.first] == recording.shows[5][found.second]
     assert float(right.double().mean()) > 0.95
     assert len(right) > 3 * sum(map(len, free))
@@ -112,18 +113,14 @@ def test_matches_are_near_their_epipolar_line(limit_px: float, near: bool) -> No
     """A keypoint twelve pixels above the line; along the line it may be anywhere."""
     T_21 = WALK.T_cw[5] @ se3_inverse(WALK.T_cw[4])
 
-    def at(*pixels: tuple[float, float]) -> FrameFeatures:
-        rows = torch.arange(len(pixels))
-        view = WALK.views[0]
-        columns = {
-            name: getattr(view, name)[rows]
-            for name in ("scales", "angles", "descriptors", "mask", "information")
-        }
-        keypoints = torch.tensor(pixels, dtype=torch.float64)
-        return replace(view, keypoints=keypoints, detected=keypoints, **columns)
+    def at(*pixels: tuple[float, float]) -> Tensor:
+        return CAMERA.unproject(torch.tensor(pixels, dtype=torch.float64))
 
     is_near = near_epipolar_line(
-        at((320, 240), (330, 250)), at((320, 228), (260, 228), (600, 250)), T_21, CAMERA, limit_px
+        at((320, 240), (330, 250)),
+        at((320, 228), (260, 228), (600, 250)),
+        T_21,
+        limit_px / float(CAMERA.focal),
     )
     allowed = is_near(torch.arange(2), torch.arange(3))
     assert torch.equal(is_near(torch.tensor([1]), torch.tensor([2, 0])), allowed[1:][:, [2, 0]])
@@ -170,7 +167,7 @@ def test_other_matchers_receive_the_pose() -> None:
     T_21: Tensor = WALK.T_cw[1]
     views = [replace(view, mask=torch.ones_like(view.mask)) for view in WALK.views]
     matcher.views = views
-    assert match_guided(matcher, 0, 1, T_21, CAMERA).first.tolist() == [0, 1, 2]
+    assert match_guided(matcher, 0, 1, T_21, ViewRays(CAMERA, views)).first.tolist() == [0, 1, 2]
     (prior,) = asked
     assert prior is not None
     assert prior.T_21 is T_21

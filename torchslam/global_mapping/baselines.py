@@ -52,15 +52,21 @@ Array = NDArray[np.float64]
 
 
 class ViewRays:
-    """Unit directions of all keypoints of images, computed once: an image is in many pairs. `focal` in pixels."""
+    """Unit directions of the keypoints of images, computed once: an image is in many pairs. `focal` in pixels."""
 
     def __init__(self, camera: Camera, views: Sequence[FrameFeatures]) -> None:
-        self.views: list[Float[Tensor, "_ 3"]] = [camera.unproject(view.keypoints) for view in views]
-        self.focal = float(camera.focal)
+        self.camera, self.focal, self._views = camera, float(camera.focal), views
+        self._rays: dict[int, Float[Tensor, "_ 3"]] = {}
+
+    def __getitem__(self, row: int) -> Float[Tensor, "_ 3"]:
+        """The directions of all keypoints of an image."""
+        if row not in self._rays:
+            self._rays[row] = self.camera.unproject(self._views[row].keypoints)
+        return self._rays[row]
 
     def of(self, pair: ViewPair) -> tuple[Float[Tensor, "M 3"], Float[Tensor, "M 3"]]:
         """The directions of the matches of a pair, in either camera."""
-        return self.views[pair.first][pair.keypoints_1], self.views[pair.second][pair.keypoints_2]
+        return self[pair.first][pair.keypoints_1], self[pair.second][pair.keypoints_2]
 
 
 @dataclass(frozen=True)
@@ -77,8 +83,8 @@ class PairDepths:
         sigma = SIGMA_PX / rays.focal
         tables = []
         for T, own, other, keypoints, count in (
-            (T_21, x_1, x_2, pair.keypoints_1, len(rays.views[pair.first])),
-            (se3_inverse(T_21), x_2, x_1, pair.keypoints_2, len(rays.views[pair.second])),
+            (T_21, x_1, x_2, pair.keypoints_1, len(rays[pair.first])),
+            (se3_inverse(T_21), x_2, x_1, pair.keypoints_2, len(rays[pair.second])),
         ):
             # other x (R own + inverse t) = 0, by least squares.
             along = torch.linalg.cross(other, own @ T[:3, :3].mT)

@@ -28,6 +28,7 @@ from torchslam.config import Config
 from torchslam.errors import ConfigError
 from torchslam.features.weights import weights_file
 from torchslam.geometry import Camera, se3_inverse
+from torchslam.global_mapping.baselines import ViewRays
 from torchslam.global_mapping.rounds import ObservedTracks, Reconstruction
 from torchslam.global_mapping.view_graph import FAR, MIN_MATCHES, THRESHOLD_PX, PairMatcher, ViewPair
 from torchslam.map.map import KEYPOINT_COLUMNS
@@ -77,10 +78,10 @@ def strengthen(
         camera: of all images.
     """
     best = {(pair.first, pair.second): pair for pair in pairs}
-    found = []
+    found, rays = [], ViewRays(camera, matcher.views)
     for one, other in pairs_around(weak_links(pairs)):
         T_21 = T_cw[other] @ se3_inverse(T_cw[one])
-        matches = match_guided(matcher, one, other, T_21, camera)
+        matches = match_guided(matcher, one, other, T_21, rays)
         if len(matches.first) >= MIN_MATCHES:
             found.append((one, other, matches.first, matches.second))
     for pair in matcher.verify(found):
@@ -117,7 +118,7 @@ def pairs_around(links: Links) -> list[tuple[int, int]]:
 
 
 def match_guided(
-    matcher: PairMatcher, one: int, other: int, T_21: Float[Tensor, "4 4"], camera: Camera
+    matcher: PairMatcher, one: int, other: int, T_21: Float[Tensor, "4 4"], rays: ViewRays
 ) -> MatchIndices:
     """Match two images of which the relative pose is known approximately.
 
@@ -126,23 +127,22 @@ def match_guided(
     view_1, view_2 = matcher.views[one], matcher.views[other]
     limit_px = EPIPOLAR_PX * matcher.threshold_px / THRESHOLD_PX
     if type(matcher.matcher) is not DescriptorMatcher or not view_1.descriptors.is_floating_point():
-        prior = MatchPrior(T_21=T_21, camera=camera, epipolar_px=limit_px)
+        prior = MatchPrior(T_21=T_21, camera=rays.camera, epipolar_px=limit_px)
         return run_matcher(matcher.matcher, view_1, view_2, prior)
-    near = near_epipolar_line(view_1, view_2, T_21, camera, limit_px)
+    near = near_epipolar_line(rays[one], rays[other], T_21, limit_px / rays.focal)
     return matcher.match_two(one, other, GUIDED_RATIO, near)
 
 
 def near_epipolar_line(
-    view_1: FrameFeatures, view_2: FrameFeatures, T_21: Float[Tensor, "4 4"], camera: Camera, limit_px: float
+    rays_1: Float[Tensor, "N 3"], rays_2: Float[Tensor, "M 3"], T_21: Float[Tensor, "4 4"], limit: float
 ) -> Callable[[Int[Tensor, " R"], Int[Tensor, " C"]], Bool[Tensor, "R C"]]:
-    """Which of some keypoints of the second view are near the epipolar line of each of some of the first.
+    """Which of some rays of the second view are within an angle of the epipolar line of each of some of the first.
 
-    In single precision, as the limit is wide.
+    In single precision, as the limit, in radians, is wide.
     """
-    rays = camera.unproject(view_1.keypoints) @ T_21[:3, :3].mT
-    normals = normalize(torch.linalg.cross(T_21[:3, 3].expand_as(rays), rays), dim=-1).float()
-    rays_2 = camera.unproject(view_2.keypoints).float()
-    limit = limit_px / float(camera.focal)
+    turned = rays_1 @ T_21[:3, :3].mT
+    normals = normalize(torch.linalg.cross(T_21[:3, 3].expand_as(turned), turned), dim=-1).float()
+    rays_2 = rays_2.float()
 
     def near(rows: Tensor, columns: Tensor) -> Tensor:
         return (normals[rows] @ rays_2[columns].mT).abs_() < limit

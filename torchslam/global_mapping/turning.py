@@ -46,9 +46,12 @@ def turning_focal(
     pixels_1, pixels_2, mask = padded_matches(views, found, given.camera.params)
     std = min(given.focal_std, MOST_FOCAL_STD)
     own = fit_rotating_camera(pixels_1, pixels_2, given.camera, std, threshold_px, mask)
+    explained = own.explains(mask, threshold_px)
+    if float(explained.double().mean()) <= TURNED:
+        return None
     shared = own.camera.with_params(own.camera.params.median(0).values)
     turned = fit_rotating_camera(pixels_1, pixels_2, shared, _SHARED_STD, threshold_px, mask)
-    explained = own.explains(mask, threshold_px) & turned.explains(mask, threshold_px)
+    explained &= turned.explains(mask, threshold_px)
     return float(shared.focal) if float(explained.double().mean()) > TURNED else None
 
 
