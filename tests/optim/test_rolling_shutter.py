@@ -178,14 +178,16 @@ def test_too_few_frames_are_not_tested() -> None:
 
 def test_the_projection_is_that_of_least_squares(generator: torch.Generator) -> None:
     derivatives = torch.randn(40, 2, 3, generator=generator, dtype=torch.float64)
-    others = torch.randn(40, 2, 2, generator=generator, dtype=torch.float64)
+    others, shared = torch.randn(2, 40, 2, 2, generator=generator, dtype=torch.float64)
     values = torch.randn(40, 2, 4, generator=generator, dtype=torch.float64)
     index, other = torch.arange(40) % 5, torch.arange(40) % 3
-    columns = torch.zeros(40, 2, 21, dtype=torch.float64)
+    columns = torch.zeros(40, 2, 23, dtype=torch.float64)
+    columns[..., 21:] = shared
     for row in range(40):
         columns[row, :, 3 * int(index[row]) :][:, :3] = derivatives[row]
         columns[row, :, 15 + 2 * int(other[row]) :][:, :2] = others[row]
     matrix, flat = columns.flatten(0, 1), values.flatten(0, 1)
     expected = flat - matrix @ torch.linalg.lstsq(matrix, flat).solution
-    found = project_out(values, [_Block.of(derivatives, index, 5), _Block.of(others, other, 3)])
+    all_same = _Block.of(shared, torch.zeros_like(index), 1)
+    found = project_out(values, [_Block.of(derivatives, index, 5), _Block.of(others, other, 3), all_same])
     torch.testing.assert_close(found.flatten(0, 1), expected, rtol=1e-3, atol=1e-4)

@@ -125,11 +125,15 @@ class _Block:
 
     def gathered(self, values: Float[Tensor, "O 2 D"]) -> Float[Tensor, "V n D"]:
         """The products of the columns with the derivatives, summed over the observations of each variable."""
+        if self.count == 1:  # one product is a quarter of the time
+            return (self.derivatives.flatten(0, 1).mT @ values.flatten(0, 1))[None]
         products = self.derivatives.mT @ values
         return products.new_zeros(self.count, *products.shape[1:]).index_add(0, self.index, products)
 
     def spread(self, steps: Float[Tensor, "V n D"]) -> Float[Tensor, "O 2 D"]:
         """What steps of the variables change."""
+        if self.count == 1:
+            return (self.derivatives.flatten(0, 1) @ steps[0]).view(len(self.index), 2, -1)
         return self.derivatives @ steps[self.index]
 
 
