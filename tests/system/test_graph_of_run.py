@@ -147,11 +147,16 @@ def adjustment_events(monkeypatch: pytest.MonkeyPatch, walk: Walk, *overrides: s
     return [event for event in events if event[1] in confirmed[1:]]
 
 
-@pytest.mark.parametrize(("delay", "translation"), [pytest.param(1, 0.1, marks=pytest.mark.slow), (2, 0.6)])
+@pytest.mark.parametrize(
+    ("delay", "translation", "few"),
+    [pytest.param(1, 0.1, 0, marks=pytest.mark.slow), (2, 0.6, 0), (2, 0.6, 1000)],
+)
 def test_an_adjustment_is_applied_after_some_frames_or_before_the_next_keyframe(
-    delay: int, translation: float, monkeypatch: pytest.MonkeyPatch
+    delay: int, translation: float, few: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    """With few points in view, before the next frame."""
     walk = Walk(arc(80, 6.0)[:40])
+    monkeypatch.setattr(state_machine, "MIN_POINTS", few)
     monkeypatch.setattr(mapper, "DELAY_FRAMES", delay)
     events = adjustment_events(monkeypatch, walk, f"keyframes.max_translation={translation}")
     kinds = [what for what, _ in events]
@@ -162,7 +167,7 @@ def test_an_adjustment_is_applied_after_some_frames_or_before_the_next_keyframe(
     ]
     assert len(waits) >= 3
     assert set(waits) <= set(range(1, delay + 1))
-    assert delay in waits
+    assert set(waits) == {1} if few else delay in waits
 
 
 @pytest.mark.slow
