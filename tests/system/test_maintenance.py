@@ -9,7 +9,7 @@ import torch
 
 from tests.loop_closing.ring import END, ring_submap
 from tests.scene import CAMERA, Scene, pose, sideways, submap_of_scene
-from tests.system.judging import Drive
+from tests.system.judging import DOUBT, Drive
 from tests.walks import Walk, arc
 from torchslam import SLAM, Config
 from torchslam.loop_closing.loop_detector import LoopCandidate
@@ -268,4 +268,13 @@ def test_a_frame_that_is_not_found_in_the_adjusted_map_is_lost(monkeypatch: pyte
     monkeypatch.setattr(tracker, "track", lambda *given: None if applied else track(*given))
     drive.until(Mode.LOST)
     assert applied == [len(drive.results)]
+    drive.check()
+
+
+def test_a_doubtful_pose_in_the_adjusted_map_is_held_back(monkeypatch: pytest.MonkeyPatch) -> None:
+    drive, applied = with_whole_adjustment(monkeypatch, few=1000)
+    monkeypatch.setattr(state_machine, "check_pose_quality", lambda *_: DOUBT)
+    drive.until(Mode.DOUBTED)
+    assert applied == [len(drive.results)]
+    assert [each.reason for each in drive.results[-1].reasons] == [DOUBT.reason]
     drive.check()

@@ -22,7 +22,13 @@ from torchslam.system.modes import TRANSITIONS
 from torchslam.system.savepoint import Savepoint
 from torchslam.system.session import SystemContext
 from torchslam.tracking.non_static import NO_MOVEMENT, FilteredView
-from torchslam.tracking.pose_validation import NUM_CONFIRMING_FRAMES, SURE_INLIERS, Certainty, Verdict
+from torchslam.tracking.pose_validation import (
+    NUM_CONFIRMING_FRAMES,
+    SURE_INLIERS,
+    Certainty,
+    Verdict,
+    check_pose_quality,
+)
 from torchslam.tracking.tracker import Relocalizer
 from torchslam.types import Explanation, FrameFeatures, PoseEstimate, PosePrediction, Reason
 
@@ -88,6 +94,8 @@ class StateMachine:
             motion = self.context.scene_filter.detect_independent_motion(filtered, estimate, submap.world)
             verdict = Verdict(motion.rejection)
         if verdict.certainty is Certainty.CERTAIN and self.active_map.doubted is None:
+            if self.mapping.is_urgent(submap, view, estimate):
+                return self._map_at_once(filtered, motion.note)
             return self._map(filtered, estimate, motion.note)
         return self._hold(view, estimate, verdict)
 
@@ -129,13 +137,6 @@ class StateMachine:
             motion: Note about keypoints that move independently of the scene.
         """
         context, view, active_map = self.context, filtered.view, self.active_map
-        if self.mapping.is_urgent(active_map.current, view, estimate):
-            self.maintenance.after_frame(None)
-            view = self._at_middle_row(active_map.current, filtered).view
-            again = context.tracker.track(active_map.current, view, PosePrediction(active_map.current.T_cw))
-            if again is None:
-                return self._lose(view)
-            estimate = again
         reason = self.mapping.add_frame(active_map.current, view, estimate, self._apply_at(estimate))
         has_new_overlay = context.session.mapping and context.scene_filter.update_overlay(
             filtered, active_map.current.T_cw, estimate.depth, active_map.current.world
@@ -150,6 +151,21 @@ class StateMachine:
         notes = [reason, Reason.STATIC_OVERLAY if has_new_overlay else None, motion]
         reasons = [note for note in notes if note is not None]
         return FrameOutcome(reasons, active_map.submap, estimate, reason is not None)
+
+    def _map_at_once(self, filtered: FilteredView, motion: Explanation | None) -> FrameOutcome:
+        """Map a frame that cannot wait for the pending adjustment: that is applied, and the frame posed again."""
+        self.maintenance.after_frame(None)
+        submap, tracker = self.active_map.current, self.context.tracker
+        filtered = self._at_middle_row(submap, filtered)
+        prediction = PosePrediction(submap.T_cw)
+        estimate = tracker.track(submap, filtered.view, prediction)
+        if estimate is None:
+            return self._lose(filtered.view)
+        tracker.correct(submap, estimate)
+        rejection = check_pose_quality(estimate, prediction)
+        if rejection is not None:
+            return self._hold(filtered.view, estimate, Verdict(rejection))
+        return self._map(filtered, estimate, motion)
 
     def _apply_at(self, estimate: PoseEstimate) -> ApplyAt:
         """When the adjustment around a new keyframe is applied.

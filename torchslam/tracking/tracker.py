@@ -203,6 +203,12 @@ class Tracker:
         else:
             submap.tracking = self._moved_to(slam_map, best, estimate.T_cw, tracking)
 
+    def correct(self, submap: Submap, estimate: PoseEstimate) -> None:
+        """Take another estimate of the last frame, in a map that was adjusted since."""
+        tracking = submap.tracking
+        T_cr = estimate.T_cw @ se3_inverse(submap.map.T_cw[tracking.reference])
+        submap.tracking = replace(tracking, T_cr=T_cr, last_inlier_points=estimate.point_ids)
+
     def start_at_estimate(self, submap: Submap, view: FrameFeatures, estimate: PoseEstimate) -> None:
         """Start the tracking state at a frame that was posed without one."""
         best = int(submap.map.count_observed(estimate.point_ids).argmax())
