@@ -211,6 +211,23 @@ def test_the_tracking_state_restarts_after_relocalization() -> None:
     assert (here.map.points["last_seen_frame"][estimate.point_ids] == 50).all()
 
 
+def test_the_last_frame_may_be_posed_anew_after_its_map_was_adjusted() -> None:
+    """Its motion stays; the pose follows the reference keyframe from where it is now."""
+    here, follower = submap(5, noise=0.0), tracker()
+    view = SCENE.view(50, sideways(1, start=0.16)[0])
+    followed(here, view, follower)
+    before, reference = here.tracking, here.tracking.reference
+    here.map.keyframes["T_cw"][:] = here.map.T_cw @ AWAY  # the adjusted map is elsewhere, but not its points
+    estimate = follower.track(here, view, PosePrediction(sideways(1, start=0.16)[0]))
+    assert estimate is not None
+    follower.correct(here, estimate)
+    torch.testing.assert_close(here.T_cw, estimate.T_cw)
+    assert here.tracking.reference == reference
+    assert not torch.allclose(here.tracking.T_cr, before.T_cr)
+    assert torch.equal(here.tracking.motions, before.motions)
+    assert torch.equal(here.tracking.last_inlier_points, estimate.point_ids)
+
+
 # --- one frame --------------------------------------------------------------------------------------------------
 
 

@@ -125,7 +125,7 @@ class _Block:
 
     def gathered(self, values: Float[Tensor, "O 2 D"]) -> Float[Tensor, "V n D"]:
         """The products of the columns with the derivatives, summed over the observations of each variable."""
-        if self.count == 1:  # one product is a quarter of the time
+        if self.count == 1:  # a single product takes a quarter of the time
             return (self.derivatives.flatten(0, 1).mT @ values.flatten(0, 1))[None]
         products = self.derivatives.mT @ values
         return products.new_zeros(self.count, *products.shape[1:]).index_add(0, self.index, products)
