@@ -18,7 +18,6 @@ from torchslam.geometry import se3_exp, se3_inverse, so3_exp
 from torchslam.global_mapping.tracks import (
     MIN_PARALLAX,
     Tracks,
-    drop_empty_rows,
     held_parts,
     join_matches,
     longest_tracks,
@@ -26,6 +25,7 @@ from torchslam.global_mapping.tracks import (
     parallax,
     ray_errors,
     triangulate_tracks,
+    without_empty_rows,
 )
 from torchslam.map.map import KEYPOINT_COLUMNS
 
@@ -308,25 +308,18 @@ def test_angles_between_rays_and_points_are_known() -> None:
     torch.testing.assert_close(found, torch.tensor([0.0, 0.2, 90, 180, 180]).double(), atol=1e-6, rtol=0)
 
 
-def test_views_lose_the_rows_that_none_uses() -> None:
-    views = Recording.of(line(2), ball(12)).views
-    masks = torch.zeros(2, 12, dtype=torch.bool)
-    masks[0, :3], masks[1, 5] = True, True
-    views = [replace(view, mask=mask) for view, mask in zip(views, masks, strict=True)]
-    before = list(views)
-    drop_empty_rows(views)
-    for view, old in zip(views, before, strict=True):
-        for name in KEYPOINT_COLUMNS:
-            assert torch.equal(getattr(view, name), getattr(old, name)[:6])
-            assert getattr(view, name).untyped_storage().nbytes() < getattr(
-                old, name
-            ).untyped_storage().nbytes() or (getattr(old, name).numel() == 0)
-    kept = list(views)
-    drop_empty_rows(views)
-    assert all(view is old for view, old in zip(views, kept, strict=True))
-    views = [replace(view, mask=torch.zeros_like(view.mask)) for view in views]
-    drop_empty_rows(views)
-    assert [len(view.mask) for view in views] == [0, 0]
+def test_a_view_loses_the_rows_after_its_last_keypoint() -> None:
+    full = Recording.of(line(2), ball(12)).views[0]
+    mask = torch.zeros(12, dtype=torch.bool)
+    assert len(without_empty_rows(replace(full, mask=mask)).mask) == 0
+    mask[[0, 5]] = True
+    old = replace(full, mask=mask)
+    view = without_empty_rows(old)
+    for name in KEYPOINT_COLUMNS:
+        assert torch.equal(getattr(view, name), getattr(old, name)[:6])
+        size = getattr(view, name).untyped_storage().nbytes()
+        assert size < getattr(old, name).untyped_storage().nbytes() or size == 0
+    assert without_empty_rows(view) is view
 
 
 # --- the map ---------------------------------------------------------------------------------------------------

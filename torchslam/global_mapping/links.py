@@ -203,9 +203,9 @@ def points_across(observed: ObservedTracks, found: Reconstruction) -> Int[Tensor
 def with_learned(
     views: Sequence[FrameFeatures], learned: Mapping[int, FrameFeatures], pairs: Sequence[ViewPair]
 ) -> LearnedPairs:
-    """Append learned keypoints that are in pairs to images, in rows that are free, or else in more rows for all.
+    """Append learned keypoints that are in pairs to images, after their own.
 
-    views: all images, with as many rows each; learned: features of some of them, by row
+    views: all images; learned: features of some of them, by row
     """
     matched = {row: torch.zeros_like(view.mask) for row, view in learned.items()}
     for pair in pairs:
@@ -215,14 +215,9 @@ def with_learned(
         row: 1 + int(torch.nonzero(views[row].mask).amax()) if views[row].mask.any() else 0 for row in learned
     }
     place = {row: begin[row] - 1 + chosen.cumsum(0) for row, chosen in matched.items()}
-    count = max(
-        [len(view.mask) for view in views] + [begin[row] + int(matched[row].sum()) for row in learned]
-    )
-    more = [
-        _in_rows(view, count) if row in learned or len(view.mask) < count else view
-        for row, view in enumerate(views)
-    ]
+    more = list(views)
     for row, own in learned.items():
+        more[row] = _in_rows(views[row], max(len(views[row].mask), begin[row] + int(matched[row].sum())))
         for name in KEYPOINT_COLUMNS:
             column, new = getattr(more[row], name), getattr(own, name)[matched[row]]
             if name == "descriptors":

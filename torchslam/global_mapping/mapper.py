@@ -40,7 +40,7 @@ from torchslam.global_mapping.rounds import (
     adjust_in_rounds,
 )
 from torchslam.global_mapping.saved_stages import SavedStages
-from torchslam.global_mapping.tracks import drop_empty_rows, keypoints_of_tracks, make_map
+from torchslam.global_mapping.tracks import keypoints_of_tracks, make_map, without_empty_rows
 from torchslam.global_mapping.view_graph import PairMatcher, ViewPair, build_view_graph
 from torchslam.global_mapping.windows import (
     KnownPoses,
@@ -81,7 +81,7 @@ LEAST_SHARED, HALVINGS = 200, 2
 """Verified matches that neighbors must have, or else a frame between them is mapped as well, and how often the distance
 is halved so. Keyframes of machine_hall have 637 in the median, those of office_loop, mapped alone, lose its loop."""
 SAVED_TOGETHER = 50
-"""Images whose features are saved in one file, 80 MB. So many, some seconds of work, are lost when a run is killed.
+"""Images whose features are saved in one file, up to 80 MB. So many, some seconds of work, are lost when a run is killed.
 Tried at this value only."""
 
 Progress = Callable[[str, int, int], None]
@@ -252,7 +252,6 @@ class GlobalMapper:
             views, self.readout = before.at_middle_row(views), before.readout
         if len(views) < MIN_VIEWS:
             return self._failed(f"no map: {len(views)} images are too few", views, [])
-        drop_empty_rows(views)
         matcher = PairMatcher(views, self.camera, self.matcher, self.config)
         pairs = build_view_graph(matcher, partial(self.progress, "matches"), self.saved.pairs)
         return_freed_memory()
@@ -515,7 +514,8 @@ class GlobalMapper:
             with torch.inference_mode():
                 features = self.extract(frame)
         assert features is not None
-        return prepare_view(FrameFeatures.of(frame, features, self.camera.params), frame, self.matcher)
+        view = prepare_view(FrameFeatures.of(frame, features, self.camera.params), frame, self.matcher)
+        return without_empty_rows(view)
 
     def _frame(self, index: int) -> Frame | None:
         """A frame; None if it cannot be read, which is counted once."""

@@ -101,9 +101,10 @@ class ObservedTracks:
     @classmethod
     def of(cls, tracks: Tracks, views: list[FrameFeatures]) -> ObservedTracks:
         """Read the observations of tracks in images."""
-        at = tracks.view, tracks.keypoint
+        counts = torch.tensor([len(view.mask) for view in views], device=tracks.view.device)
+        at = (counts.cumsum(0) - counts)[tracks.view] + tracks.keypoint
         columns = (
-            torch.stack([getattr(view, name) for view in views])[at]
+            torch.cat([getattr(view, name) for view in views])[at]
             for name in ("keypoints", "scales", "information")
         )
         pixels, scales, information = columns
@@ -112,7 +113,7 @@ class ObservedTracks:
     @classmethod
     def join(cls, pairs: list[ViewPair], views: list[FrameFeatures]) -> ObservedTracks:
         """The tracks of the matches of pairs that at least `MIN_VIEWS` images see."""
-        tracks = join_matches(pairs, len(views), len(views[0].mask))
+        tracks = join_matches(pairs, len(views), max(len(view.mask) for view in views))
         tracks, _ = tracks.select(torch.ones_like(tracks.track, dtype=torch.bool), MIN_VIEWS)
         return cls.of(tracks, views)
 

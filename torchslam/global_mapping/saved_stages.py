@@ -2,7 +2,7 @@
 
 A run that was killed finds what it had, and goes on with the same bytes. The name of a file is a hash of all that its
 content depends on, so what belongs to another run, or to other images, is never read; a checksum of its content tells
-damage. One image takes about 1.6 MB.
+damage. One image takes .6 KB for each of its keypoints.
 """
 
 from __future__ import annotations
@@ -64,15 +64,20 @@ class SavedStages:
             if len(known) < len(found):
                 return None
             times = torch.tensor([view.timestamp for view in known], dtype=torch.float64, device="cpu")
-            return {"timestamp": times} | {
-                name: torch.stack([getattr(view, name) for view in known]) for name in COLUMNS
+            counts = torch.tensor([len(view.mask) for view in known], dtype=torch.int64, device="cpu")
+            return {"timestamp": times, "count": counts} | {
+                name: torch.cat([getattr(view, name) for view in known]) for name in COLUMNS
             }
 
         def unpack(columns: _Columns) -> list[FrameFeatures | None]:
             views: list[FrameFeatures | None] = []
-            for row, (index, time) in enumerate(zip(images, columns["timestamp"].tolist(), strict=True)):
+            counts = columns["count"].tolist()
+            rows = zip(*(columns[name].split(counts) for name in COLUMNS), strict=True)
+            for index, time, of_view in zip(images, columns["timestamp"].tolist(), rows, strict=True):
                 # In memory of their own: a sum over rows that lie elsewhere in a cache line may have other last bits.
-                own: dict[str, Any] = {name: columns[name][row].clone() for name in COLUMNS}
+                own: dict[str, Any] = {
+                    name: column.clone() for name, column in zip(COLUMNS, of_view, strict=True)
+                }
                 views.append(FrameFeatures(index, time, **own))
             return views
 

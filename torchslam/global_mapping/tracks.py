@@ -67,7 +67,7 @@ class Tracks:
 def join_matches(pairs: list[ViewPair], views: int, keypoints: int) -> Tracks:
     """Join matches to tracks, their connected components, without observations by two keypoints of one image.
 
-    `views` and `keypoints`: number of images, and of the keypoints of each.
+    `views` and `keypoints`: number of images, and the largest number of keypoints of one.
     """
     none = torch.zeros(0, dtype=torch.int64, device=pairs[0].keypoints_1.device if pairs else "cpu")
     one = torch.cat([none, *(pair.first * keypoints + pair.keypoints_1 for pair in pairs)])
@@ -207,18 +207,14 @@ def _sums(tracks: Tracks, values: Float[Tensor, "O *n"]) -> Float[Tensor, "N *n"
     return total.view(tracks.count, *values.shape[1:])
 
 
-def drop_empty_rows(views: list[FrameFeatures]) -> None:
-    """Give views as many rows each as the one with most keypoints needs; extractors pad all to the same number.
-
-    In place, one after the other, since descriptors are most of the memory.
-    """
-    used = torch.stack([view.mask for view in views]).any(0).nonzero()
+def without_empty_rows(view: FrameFeatures) -> FrameFeatures:
+    """The view without the rows after its last keypoint, in memory of its own: extractors pad all to the same number,
+    and descriptors are most of the memory."""
+    used = view.mask.nonzero()
     most = 1 + int(used.amax()) if len(used) else 0
-    if most < len(views[0].mask):
-        for row, view in enumerate(views):
-            views[row] = replace(
-                view, **{name: getattr(view, name)[:most].clone() for name in KEYPOINT_COLUMNS}
-            )
+    if most == len(view.mask):
+        return view
+    return replace(view, **{name: getattr(view, name)[:most].clone() for name in KEYPOINT_COLUMNS})
 
 
 def keypoints_of_tracks(views: Sequence[FrameFeatures], tracks: Tracks) -> tuple[list[FrameFeatures], Tracks]:

@@ -39,7 +39,7 @@ from torchslam.optim.bundle._reduced import (
 # Small enough for a tile's coupling to stay in the cache, large enough for its product to be worth the call. Where many
 # frames see a place again and again, a tile has a column for each of them: fewer points share them better.
 _TILE_POINTS, _TILE_POINTS_OF_MANY = 512, 64
-_MANY_FRAMES = 64
+MANY_FRAMES = 64
 """Frames from which on the tiles are smaller."""
 _STRIP = 120
 """Columns of a tile's coupling whose products with themselves and all later ones are computed at once, a multiple of 6.
@@ -99,7 +99,7 @@ class Structure:
     """Which observation joins which frame, camera and point; made once per problem.
 
     Free frames have slots 0 ... K-1 in the reduced system. Observations are ordered by frame, those of free frames
-    first; points by the first free frame that sees them.
+    first; points by the first and the last free frame that see them, or nearly so.
 
     Attributes:
         frame_ends: for every free frame, the end of its observations
@@ -198,7 +198,7 @@ def build_structure(
     num_frames = len(cameras)
     frame_ends = torch.bincount(frame_slots, minlength=num_frames + 1)[:num_frames].cumsum(0).tolist()
     linked = frame_ends[-1] if frame_ends else 0
-    height = _TILE_POINTS if num_frames <= _MANY_FRAMES else _TILE_POINTS_OF_MANY
+    height = _TILE_POINTS if num_frames <= MANY_FRAMES else _TILE_POINTS_OF_MANY
     coupling, frames_of = _stored(frame_slots[:linked], point_index[:linked], num_frames, num_points, height)
     by_point, pair = Groups.of(point_index, num_points), point_index * num_cameras + camera_of
     order = torch.argsort(pair, stable=True) if num_cameras > 1 else by_point.order

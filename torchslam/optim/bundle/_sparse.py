@@ -58,6 +58,7 @@ from torchslam.optim.bundle._problem import (
 )
 from torchslam.optim.bundle._schur import (
     AT_ONCE,
+    MANY_FRAMES,
     BundleTangent,
     FactorizedEquations,
     Marginals,
@@ -73,6 +74,10 @@ _DRIFT, _DRIFT_GAIN, _DRIFT_STEPS = 0.3, 0.01, 10
 """A minimization with factors is given up after this many steps that each lower the cost by less than this share, while
 the factors still ask for a scale that differs by this one. Healthy ones reach it in a few steps. Tried at these values
 only."""
+_NEIGHBORS = 8
+"""Frames that count as one where points are ordered by the first and the last of many frames that see them. On
+courthouse tiles have a fifth fewer frames than with the exact order, and two adjustments take .91 and .99 of the time.
+Tried 1 to 12."""
 _INNER_FRAMES = 32
 """Free frames from which on points take steps of their own: parts of a window of few frames do not move against each
 other, and it converges in a few steps."""
@@ -139,7 +144,8 @@ def build_sparse_layout(
     last = torch.full_like(first, -1)
     last = last.scatter_reduce(0, point_index[rows], slots[frames], "amax")
     # So that the frames of a tile are few.
-    point_order = torch.argsort(first * (count + 2) + last, stable=True)
+    alike = _NEIGHBORS if count > MANY_FRAMES else 1
+    point_order = torch.argsort((first // alike) * (count + 2) + last // alike, stable=True)
     point_rank = torch.argsort(point_order)
     points = point_rank[point_index[rows]]
     free = free_frames.nonzero().squeeze(-1)
