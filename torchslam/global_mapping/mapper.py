@@ -81,7 +81,7 @@ LEAST_SHARED, HALVINGS = 200, 2
 """Verified matches that neighbors must have, or else a frame between them is mapped as well, and how often the distance
 is halved so. Keyframes of machine_hall have 637 in the median, those of office_loop, mapped alone, lose its loop."""
 SAVED_TOGETHER = 50
-"""Images whose features are saved in one file, up to 80 MB. So many, some seconds of work, are lost when a run is killed.
+"""Images whose features are saved in one file of up to 80 MB. As many, some seconds of work, are lost if a run is killed.
 Tried at this value only."""
 
 Progress = Callable[[str, int, int], None]
