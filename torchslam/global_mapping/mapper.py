@@ -81,8 +81,8 @@ LEAST_SHARED, HALVINGS = 200, 2
 """Verified matches that neighbors must have, or else a frame between them is mapped as well, and how often the distance
 is halved so. Keyframes of machine_hall have 637 in the median, those of office_loop, mapped alone, lose its loop."""
 SAVED_TOGETHER = 50
-"""Images whose features are saved in one file of up to 80 MB. As many, some seconds of work, are lost if a run is killed.
-Tried at this value only."""
+"""Images whose features are saved in one file of up to 80 MB. As many, some seconds of work, are lost if a run is
+killed. Tried at this value only."""
 
 Progress = Callable[[str, int, int], None]
 """Called with the name of a stage, what is done of it, and all that is to be done."""
