@@ -273,19 +273,34 @@ def test_points_settle_where_their_own_cost_is_lower(monkeypatch, bundle_scene):
 
 
 def test_points_that_step_too_far_do_not_stop_the_others(monkeypatch, bundle_scene):
-    """Where the joint step raises the cost, such points go back."""
+    """Where the joint step raises the cost, such points go back, and are held in the joint steps that follow."""
     problem = bundle_scene(frames=6, points=40, perturbation=0.05).problem
     monkeypatch.setattr(_sparse, "_INNER_FRAMES", 2)
-    settle = SparseBundle._settled
+    settle, moved, held = SparseBundle._settled, [], []
 
     def settled(self, estimate, model):
         points_w = estimate.points_w.clone()
-        points_w[::4] *= -1.0  # behind the cameras
-        return settle(self, estimate._replace(points_w=points_w), model)
+        moved.append((points_w - model.estimate.points_w).norm(dim=-1))
+        if len(moved) == 1:
+            points_w[::4] *= -1.0  # behind the cameras
+        found = settle(self, estimate._replace(points_w=points_w), model)
+        held.append(self.own_damping.clone())
+        return found
 
     monkeypatch.setattr(SparseBundle, "_settled", settled)
     start = float(adjusted(problem, iterations=0).cost)
     assert float(adjusted(problem, iterations=1).cost) < 0.5 * start  # else the step is refused
+    moved.clear(), held.clear()
+    adjusted(problem, iterations=2)
+    back = torch.zeros(40, dtype=torch.bool)
+    back[::4] = True
+    assert torch.equal(held[0], back.double())
+    assert torch.equal(held[1], 0.1 * back.double())
+    free = moved.copy()
+    monkeypatch.setattr(_sparse, "_HELD", 1e-3)
+    moved.clear()
+    adjusted(problem, iterations=2)
+    assert bool((free[1][back] < moved[1][back]).all())
 
 
 def test_steps_of_points_lead_to_the_same_minimum(monkeypatch, bundle_scene):

@@ -302,15 +302,21 @@ class NormalEquations:
     joined: PointBlocks | None = None
 
     def factorized(
-        self, damping: Float[Tensor, "*#scale"] | None = None, gauge: Float[Tensor, "K D g"] | None = None
+        self,
+        damping: Float[Tensor, "*#scale"] | None = None,
+        gauge: Float[Tensor, "K D g"] | None = None,
+        of_points: Float[Tensor, " N"] | None = None,
     ) -> FactorizedEquations:
-        """Eliminate the points and factorize what is left, after the diagonals grew by the share `damping`.
+        """Eliminate the points and factorize what is left, after the diagonals grew by the share `damping`, or, those
+        of points, by `of_points` where that is larger.
 
         Points that their observations do not determine are left out, as if fixed. Along the gauge, directions of the
         frames, the solution is zero: if they span the null space of the observations, solutions for right sides
         orthogonal to it do not change.
         """
         blocks, grown = self.points.permute(1, 2, 0), None if damping is None else damping.reshape(1)
+        if grown is not None and of_points is not None:
+            grown = torch.maximum(grown, of_points)
         root = inverse_roots(blocks, self.free_points, grown).permute(2, 0, 1).contiguous()
         directions = None if gauge is None else gauge.flatten(0, 1)
         find = self._dense if self.structure.pairs is None else self._blocks
