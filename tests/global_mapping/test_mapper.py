@@ -33,7 +33,7 @@ from torchslam.global_mapping.mapper import (
     poses_of,
 )
 from torchslam.global_mapping.rounds import COARSE
-from torchslam.global_mapping.view_graph import Relation, ViewPair
+from torchslam.global_mapping.view_graph import PairMatcher, Relation, ViewPair
 from torchslam.optim.sensor_estimate import CONTRADICTED
 from torchslam.system.front_end import Simulated
 from torchslam.system.online_run import OnlineRun
@@ -85,6 +85,12 @@ def result(index: int, state: State, is_keyframe: bool = False) -> StepResult:
 )
 def test_images_are_spread_evenly(count: int, most: int, chosen: list[int]) -> None:
     assert choose_images(count, [], most) == chosen
+
+
+def test_images_of_short_recordings_have_a_spacing_and_the_last_frame() -> None:
+    assert choose_images(10, [], 10, 4) == [0, 4, 8, 9]
+    assert choose_images(9, [], 10, 4) == [0, 4, 8]
+    assert choose_images(10, [result(6, State.LOST)], 10, 4) == [0, 4, 6, 8, 9]
 
 
 def test_images_of_long_recordings_are_keyframes_and_doubtful_frames() -> None:
@@ -178,6 +184,35 @@ def test_frames_between_keyframes_that_share_too_little_are_mapped(
     monkeypatch.setattr("torchslam.global_mapping.mapper.LEAST_SHARED", enough)
     results = [result(index, State.TRACKING, index in (0, 8, 16, 24)) for index in range(30)]
     assert [view.index for view in map_whole(WALK, results=results).views] == chosen
+
+
+@pytest.mark.parametrize(
+    ("enough", "chosen"),
+    [(20, [*range(0, 30, 4), 29]), (1000, list(range(30)))],
+    ids=["enough", "too few"],
+)
+def test_frames_of_short_recordings_are_mapped_where_fewer_share_too_little(
+    monkeypatch: pytest.MonkeyPatch, enough: int, chosen: list[int]
+) -> None:
+    """Every fourth, or else every second, or else every one; all of very few."""
+    monkeypatch.setattr("torchslam.global_mapping.mapper.LEAST_SHARED", enough)
+    whole = "global_mapping.window_images=30"
+    assert [view.index for view in map_whole(WALK, whole).views] == list(range(30))
+    monkeypatch.setattr("torchslam.global_mapping.mapper.FEW_FRAMES", 29)
+    tried, match = list[int](), PairMatcher.match
+
+    def counted(self: PairMatcher, pairs: Iterable[tuple[int, int]]) -> list[ViewPair]:
+        pairs = list(pairs)
+        tried.append(len(pairs))
+        return match(self, pairs)
+
+    monkeypatch.setattr(PairMatcher, "match", counted)
+    monkeypatch.setattr("torchslam.global_mapping.mapper.SAMPLE", 3)
+    found = map_whole(WALK, whole)
+    assert [view.index for view in found.views] == chosen
+    assert len(found.run.trajectory) == 30
+    # Of seven pairs, as 29 follows 28, the sample and then the others; or samples of seven and of fourteen.
+    assert tried[:2] == ([4, 3] if enough < 1000 else [4, 4])
 
 
 def test_doubtful_frames_of_an_online_run_are_mapped() -> None:

@@ -80,6 +80,11 @@ HELD_BACK_DISTANCE = 2
 LEAST_SHARED, HALVINGS = 200, 2
 """Verified matches that neighbors must have, or else a frame between them is mapped as well, and how often the distance
 is halved so. Keyframes of machine_hall have 637 in the median, those of office_loop, mapped alone, lose its loop."""
+FEW_FRAMES = 40
+"""Frames up to which all of a recording are mapped; of more, those that overlap by so much."""
+SAMPLE, LEAST_OVERLAP = 12, 0.25
+"""Pairs of neighbors that are matched first, and the share of them that must have so many matches: else all neighbors
+count as too far apart, and no more of them are matched."""
 SAVED_TOGETHER = 50
 """Images whose features are saved in one file of up to 80 MB. As many, some seconds of work, are lost if a run is
 killed. Tried at this value only."""
@@ -159,8 +164,8 @@ def features_to_keep(
     return KeptFeatures(image_extractor(mapping, device))
 
 
-def choose_images(count: int, results: Rows[StepResult], most: int) -> list[int]:
-    """The frames that are mapped: all of a short recording, else by what they have in common.
+def choose_images(count: int, results: Rows[StepResult], most: int, spacing: int = 1) -> list[int]:
+    """The frames that are mapped: those of a short recording at equal distances, else by what they have in common.
 
     The keyframes of an online run overlap as they should; without any, frames are spread evenly. Where the run was lost
     or uncertain, frames follow each other twice as fast as these do.
@@ -169,10 +174,13 @@ def choose_images(count: int, results: Rows[StepResult], most: int) -> list[int]
         count: the number of frames.
         results: of an online run.
         most: frames of a recording that is short, or that are spread evenly.
+        spacing: distance of the frames of a short recording; the last one is among them.
     """
     keyframes = sorted({result.index for result in results if result.is_keyframe})
     if count <= most or len(keyframes) < MIN_VIEWS:
-        keyframes = list(range(0, count, -(-count // most)))
+        keyframes = list(range(0, count, max(spacing, -(-count // most))))
+        if spacing > 1 and count - 1 not in keyframes:
+            keyframes.append(count - 1)
     gap = median(after - before for before, after in pairwise([*keyframes, count]))
     chosen, last = set(keyframes), -count
     for result in results:
@@ -244,9 +252,11 @@ class GlobalMapper:
             raise ConfigError(
                 "global_mapping.learned_links requires images; the recording has precomputed features"
             )
-        images = choose_images(len(self.sequence), results, self.config.global_mapping.window_images)
-        views = self._saved_views(images)
-        if any(result.is_keyframe for result in results):
+        count, most = len(self.sequence), self.config.global_mapping.window_images
+        is_short = FEW_FRAMES < count <= most
+        spacing = 2**HALVINGS if is_short else 1
+        views = self._saved_views(choose_images(count, results, most, spacing))
+        if is_short or any(result.is_keyframe for result in results):
             views = self._overlapping(views)
         if before is not None:
             views, self.readout = before.at_middle_row(views), before.readout
@@ -475,18 +485,27 @@ class GlobalMapper:
                 for row, (before, after) in enumerate(ends)
                 if after - before > 1 and ends[row] not in tried
             ]
-            if not apart:
-                break
-            matcher = PairMatcher(views, self.camera, self.matcher, self.config)
-            found = {
-                pair.first: len(pair) for pair in self.saved.pairs(matcher, ((row, row + 1) for row in apart))
-            }
             tried |= {ends[row] for row in apart}
-            more = [sum(ends[row]) // 2 for row in apart if found.get(row, 0) < LEAST_SHARED]
+            overlap = self._overlap(views, apart)
+            more = [sum(ends[row]) // 2 for row in apart if row not in overlap]
             if not more:
                 break
             views = sorted(views + self._saved_views(more), key=lambda view: view.index)
         return views
+
+    def _overlap(self, views: list[FrameFeatures], rows: list[int]) -> set[int]:
+        """The rows of views that overlap with the next one; none where hardly any of a sample of them do."""
+        matcher = PairMatcher(views, self.camera, self.matcher, self.config)
+
+        def among(some: list[int]) -> set[int]:
+            pairs = self.saved.pairs(matcher, ((row, row + 1) for row in some))
+            return {pair.first for pair in pairs if len(pair) >= LEAST_SHARED}
+
+        sample = rows[:: max(1, len(rows) // SAMPLE)]
+        found = among(sample)
+        if len(found) < LEAST_OVERLAP * len(sample):
+            return set()
+        return found | among(sorted(set(rows) - set(sample)))
 
     def _saved_views(self, images: list[int]) -> list[FrameFeatures]:
         """The features of the images that can be read, saved in groups."""

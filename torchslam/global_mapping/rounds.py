@@ -63,8 +63,9 @@ that flies off stops the steps of all others. COLMAP asks for 30 to register an 
 MIN_SHARED = 5
 """Points that must hold an image with its neighbors in a track. Parts that nothing holds go anywhere, and shrink to a
 point where their own rays allow it: on office_loop such a part had one; right weak links there have 16 and more."""
-MAX_ROUNDS, MIN_CHANGE = 4, 0.005
-"""Fine rounds go on until less than this share of the observations changes sides."""
+MAX_ROUNDS, MIN_CHANGE = 4, 0.03
+"""Fine rounds go on until less than this share of the observations changes sides. The final adjustment follows: with
+.005 and one more round, twelve recordings and parts end at the same errors (within 2 %)."""
 
 
 @dataclass(frozen=True)
