@@ -87,12 +87,6 @@ def test_images_are_spread_evenly(count: int, most: int, chosen: list[int]) -> N
     assert choose_images(count, [], most) == chosen
 
 
-def test_images_of_short_recordings_have_a_spacing_and_the_last_frame() -> None:
-    assert choose_images(10, [], 10, 4) == [0, 4, 8, 9]
-    assert choose_images(9, [], 10, 4) == [0, 4, 8]
-    assert choose_images(10, [result(6, State.LOST)], 10, 4) == [0, 4, 6, 8, 9]
-
-
 def test_images_of_long_recordings_are_keyframes_and_doubtful_frames() -> None:
     """Doubtful frames twice as close as keyframes; with fewer than three keyframes the overlap is not known."""
     keyframes = (0, 4, 8, 30)
@@ -198,7 +192,7 @@ def test_frames_of_short_recordings_are_mapped_where_fewer_share_too_little(
     monkeypatch.setattr("torchslam.global_mapping.mapper.LEAST_SHARED", enough)
     whole = "global_mapping.window_images=30"
     assert [view.index for view in map_whole(WALK, whole).views] == list(range(30))
-    monkeypatch.setattr("torchslam.global_mapping.mapper.FEW_FRAMES", 29)
+    monkeypatch.setattr("torchslam.global_mapping.mapper.FEW_IMAGES", 29)
     tried, match = list[int](), PairMatcher.match
 
     def counted(self: PairMatcher, pairs: Iterable[tuple[int, int]]) -> list[ViewPair]:
@@ -213,6 +207,21 @@ def test_frames_of_short_recordings_are_mapped_where_fewer_share_too_little(
     assert len(found.run.trajectory) == 30
     # Of seven pairs, as 29 follows 28, the sample and then the others; or samples of seven and of fourteen.
     assert tried[:2] == ([4, 3] if enough < 1000 else [4, 4])
+
+
+@pytest.mark.parametrize(
+    ("enough", "chosen"),
+    [(20, [0, 12, 24]), (1000, [0, 1, 2, *range(3, 24), 24])],
+    ids=["enough", "too few"],
+)
+def test_keyframes_that_others_overlap_are_left_out(
+    monkeypatch: pytest.MonkeyPatch, enough: int, chosen: list[int]
+) -> None:
+    """And frames between them where even they share too little."""
+    monkeypatch.setattr("torchslam.global_mapping.mapper.LEAST_SHARED", enough)
+    monkeypatch.setattr("torchslam.global_mapping.mapper.FEW_IMAGES", 8)
+    results = [result(index, State.TRACKING, index % 3 == 0 and index < 25) for index in range(30)]
+    assert [view.index for view in map_whole(WALK, results=results).views] == chosen
 
 
 def test_doubtful_frames_of_an_online_run_are_mapped() -> None:

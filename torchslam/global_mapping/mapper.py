@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from bisect import bisect_left, bisect_right
 from collections.abc import Callable, Collection, Iterable, Iterator
 from collections.abc import Sequence as Rows
 from dataclasses import dataclass, replace
@@ -80,8 +81,8 @@ HELD_BACK_DISTANCE = 2
 LEAST_SHARED, HALVINGS = 200, 2
 """Verified matches that neighbors must have, or else a frame between them is mapped as well, and how often the distance
 is halved so. Keyframes of machine_hall have 637 in the median, those of office_loop, mapped alone, lose its loop."""
-FEW_FRAMES = 40
-"""Frames up to which all of a recording are mapped; of more, those that overlap by so much."""
+FEW_IMAGES = 40
+"""Frames or keyframes up to which all are mapped; of more, those that overlap by so much."""
 SAMPLE, LEAST_OVERLAP = 12, 0.25
 """Pairs of neighbors that are matched first, and the share of them that must have so many matches: else all neighbors
 count as too far apart, and no more of them are matched."""
@@ -164,8 +165,8 @@ def features_to_keep(
     return KeptFeatures(image_extractor(mapping, device))
 
 
-def choose_images(count: int, results: Rows[StepResult], most: int, spacing: int = 1) -> list[int]:
-    """The frames that are mapped: those of a short recording at equal distances, else by what they have in common.
+def choose_images(count: int, results: Rows[StepResult], most: int) -> list[int]:
+    """The frames that may be mapped: all of a short recording, else by what they have in common.
 
     The keyframes of an online run overlap as they should; without any, frames are spread evenly. Where the run was lost
     or uncertain, frames follow each other twice as fast as these do.
@@ -174,13 +175,10 @@ def choose_images(count: int, results: Rows[StepResult], most: int, spacing: int
         count: the number of frames.
         results: of an online run.
         most: frames of a recording that is short, or that are spread evenly.
-        spacing: distance of the frames of a short recording; the last one is among them.
     """
     keyframes = sorted({result.index for result in results if result.is_keyframe})
     if count <= most or len(keyframes) < MIN_VIEWS:
-        keyframes = list(range(0, count, max(spacing, -(-count // most))))
-        if spacing > 1 and count - 1 not in keyframes:
-            keyframes.append(count - 1)
+        keyframes = list(range(0, count, -(-count // most)))
     gap = median(after - before for before, after in pairwise([*keyframes, count]))
     chosen, last = set(keyframes), -count
     for result in results:
@@ -252,12 +250,8 @@ class GlobalMapper:
             raise ConfigError(
                 "global_mapping.learned_links requires images; the recording has precomputed features"
             )
-        count, most = len(self.sequence), self.config.global_mapping.window_images
-        is_short = FEW_FRAMES < count <= most
-        spacing = 2**HALVINGS if is_short else 1
-        views = self._saved_views(choose_images(count, results, most, spacing))
-        if is_short or any(result.is_keyframe for result in results):
-            views = self._overlapping(views)
+        images = choose_images(len(self.sequence), results, self.config.global_mapping.window_images)
+        views = self._overlapping(images, any(result.is_keyframe for result in results))
         if before is not None:
             views, self.readout = before.at_middle_row(views), before.readout
         if len(views) < MIN_VIEWS:
@@ -475,19 +469,24 @@ class GlobalMapper:
             read_zoom=self.sequence.zoom,
         )
 
-    def _overlapping(self, views: list[FrameFeatures]) -> list[FrameFeatures]:
-        """Views, and those of frames between neighbors that have too few verified matches."""
-        tried: set[tuple[int, int]] = set()
-        for _ in range(HALVINGS):
-            ends = [(before.index, after.index) for before, after in pairwise(views)]
-            apart = [
-                row
-                for row, (before, after) in enumerate(ends)
-                if after - before > 1 and ends[row] not in tried
-            ]
-            tried |= {ends[row] for row in apart}
-            overlap = self._overlap(views, apart)
-            more = [sum(ends[row]) // 2 for row in apart if row not in overlap]
+    def _overlapping(self, images: list[int], among: bool) -> list[FrameFeatures]:
+        """The views of every few of the images, and of those between neighbors that have too few verified matches.
+
+        among: where even neighbors of the images have too few, also of frames between them
+        """
+        halvings = 0 if len(images) <= FEW_IMAGES else HALVINGS
+        views = self._saved_views(sorted({*images[:: 2**halvings], *images[-1:]}))
+        tried = set[tuple[int, int]]()
+        for _ in range(halvings + HALVINGS):
+            gaps = [(before.index, after.index) for before, after in pairwise(views)]
+            middles = {
+                row: middle
+                for row, gap in enumerate(gaps)
+                if gap not in tried and (middle := _middle(images, *gap, among)) is not None
+            }
+            tried |= {gaps[row] for row in middles}
+            overlap = self._overlap(views, list(middles))
+            more = [middle for row, middle in middles.items() if row not in overlap]
             if not more:
                 break
             views = sorted(views + self._saved_views(more), key=lambda view: view.index)
@@ -612,6 +611,14 @@ def known_poses(run: Run, certain: Collection[int], views: list[FrameFeatures]) 
     T_cw, is_posed = poses_of(run, views)
     is_certain = torch.tensor([view.index in certain for view in views], dtype=torch.bool, device="cpu")
     return KnownPoses(T_cw, is_posed & is_certain, run.camera)
+
+
+def _middle(images: list[int], before: int, after: int, among: bool) -> int | None:
+    """The middle one of the images between two frames; among: else the frame in the middle, if there is one."""
+    between = images[bisect_right(images, before) : bisect_left(images, after)]
+    if between:
+        return between[len(between) // 2]
+    return (before + after) // 2 if among and after - before > 1 else None
 
 
 def choose_held_back(pairs: list[ViewPair]) -> frozenset[int]:
