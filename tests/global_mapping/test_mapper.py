@@ -189,7 +189,7 @@ def test_frames_of_short_recordings_are_mapped_where_fewer_share_too_little(
     monkeypatch: pytest.MonkeyPatch, enough: int, chosen: list[int]
 ) -> None:
     """Every fourth, or else every second, or else every one; all of very few."""
-    monkeypatch.setattr("torchslam.global_mapping.mapper.LEAST_SHARED", enough)
+    monkeypatch.setattr("torchslam.global_mapping.mapper.ENOUGH_SHARED", enough)
     whole = "global_mapping.window_images=30"
     assert [view.index for view in map_whole(WALK, whole).views] == list(range(30))
     monkeypatch.setattr("torchslam.global_mapping.mapper.FEW_IMAGES", 29)
@@ -219,6 +219,7 @@ def test_keyframes_that_others_overlap_are_left_out(
 ) -> None:
     """And frames between them where even they share too little."""
     monkeypatch.setattr("torchslam.global_mapping.mapper.LEAST_SHARED", enough)
+    monkeypatch.setattr("torchslam.global_mapping.mapper.ENOUGH_SHARED", enough)
     monkeypatch.setattr("torchslam.global_mapping.mapper.FEW_IMAGES", 8)
     results = [result(index, State.TRACKING, index % 3 == 0 and index < 25) for index in range(30)]
     assert [view.index for view in map_whole(WALK, results=results).views] == chosen

@@ -81,6 +81,9 @@ HELD_BACK_DISTANCE = 2
 LEAST_SHARED, HALVINGS = 200, 2
 """Verified matches that neighbors must have, or else a frame between them is mapped as well, and how often the distance
 is halved so. Keyframes of machine_hall have 637 in the median, those of office_loop, mapped alone, lose its loop."""
+ENOUGH_SHARED = 400
+"""Verified matches of neighbors from which on frames or keyframes between them are left out. With 200 the error of
+garden doubles."""
 FEW_IMAGES = 40
 """Frames or keyframes up to which all are mapped; of more, those that overlap by so much."""
 SAMPLE, LEAST_OVERLAP = 12, 0.25
@@ -485,21 +488,29 @@ class GlobalMapper:
                 if gap not in tried and (middle := _middle(images, *gap, among)) is not None
             }
             tried |= {gaps[row] for row in middles}
-            overlap = self._overlap(views, list(middles))
+            overlap = self._overlap(
+                views,
+                {
+                    row: ENOUGH_SHARED if middle in images else LEAST_SHARED
+                    for row, middle in middles.items()
+                },
+            )
             more = [middle for row, middle in middles.items() if row not in overlap]
             if not more:
                 break
             views = sorted(views + self._saved_views(more), key=lambda view: view.index)
         return views
 
-    def _overlap(self, views: list[FrameFeatures], rows: list[int]) -> set[int]:
-        """The rows of views that overlap with the next one; none where hardly any of a sample of them do."""
+    def _overlap(self, views: list[FrameFeatures], least: dict[int, int]) -> set[int]:
+        """The rows of views that have at least so many verified matches with the next one; none where hardly any of a
+        sample of them do."""
         matcher = PairMatcher(views, self.camera, self.matcher, self.config)
 
-        def among(some: list[int]) -> set[int]:
-            pairs = self.saved.pairs(matcher, ((row, row + 1) for row in some))
-            return {pair.first for pair in pairs if len(pair) >= LEAST_SHARED}
+        def among(rows: list[int]) -> set[int]:
+            pairs = self.saved.pairs(matcher, ((row, row + 1) for row in rows))
+            return {pair.first for pair in pairs if len(pair) >= least[pair.first]}
 
+        rows = sorted(least)
         sample = rows[:: max(1, len(rows) // SAMPLE)]
         found = among(sample)
         if len(found) < LEAST_OVERLAP * len(sample):
