@@ -490,10 +490,7 @@ class GlobalMapper:
             tried |= {gaps[row] for row in middles}
             overlap = self._overlap(
                 views,
-                {
-                    row: ENOUGH_SHARED if middle in images else LEAST_SHARED
-                    for row, middle in middles.items()
-                },
+                {row: ENOUGH_SHARED if middle in images else LEAST_SHARED for row, middle in middles.items()},
             )
             more = [middle for row, middle in middles.items() if row not in overlap]
             if not more:

@@ -290,17 +290,17 @@ def test_points_that_step_too_far_do_not_stop_the_others(monkeypatch, bundle_sce
     monkeypatch.setattr(SparseBundle, "_settled", settled)
     start = float(adjusted(problem, iterations=0).cost)
     assert float(adjusted(problem, iterations=1).cost) < 0.5 * start  # else the step is refused
-    moved.clear(), held.clear()
-    adjusted(problem, iterations=2)
-    back = torch.zeros(40, dtype=torch.bool)
-    back[::4] = True
-    assert torch.equal(held[0], back.double())
-    assert torch.equal(held[1], 0.1 * back.double())
-    free = moved.copy()
-    monkeypatch.setattr(_sparse, "_HELD", 1e-3)
-    moved.clear()
-    adjusted(problem, iterations=2)
-    assert bool((free[1][back] < moved[1][back]).all())
+    back = torch.zeros(40, dtype=torch.float64)
+    back[::4] = 1
+    lengths = []
+    for least in (1.0, 10.0):
+        monkeypatch.setattr(_sparse, "_HELD", least)
+        moved.clear(), held.clear()
+        adjusted(problem, iterations=2)
+        assert torch.equal(held[0], least * back)
+        assert torch.equal(held[1], 0.1 * least * back)
+        lengths.append(moved[1])
+    assert bool((lengths[1][back > 0] < lengths[0][back > 0]).all())
 
 
 def test_steps_of_points_lead_to_the_same_minimum(monkeypatch, bundle_scene):

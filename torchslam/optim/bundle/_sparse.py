@@ -94,11 +94,11 @@ _INNER_STEPS_BACK = 6
 step takes as long as ten of them. So the rounds and the final adjustment of courthouse need 66 steps in place of 93."""
 _RAISED = 1e-8
 """Share of the cost by which it must rise for that: far above rounding, far below what a single point does."""
-_HELD, _MOST_HELD = 1.0, 1e8
+_HELD, _MOST_HELD = 1e-4, 1e8
 """Least and largest damping of its own that a point has in the next joint step after it went back; while it does not, a
 tenth of it with every step. Few points that rays hardly hold step to infinity and back, and promise reductions that
-never come: on courthouse three of 7,000 made a coarse adjustment take 17 steps in place of 11. Tried at these values
-only."""
+never come: on courthouse three of 7,000 made a coarse adjustment take 17 steps in place of 8. The least was tried at
+1e-4, .01 and 1: with larger ones, points that only went too far once are slowed down."""
 _LEAST_CURVATURE, _LOOSE = 0.01, 0.3
 """How much of its Gauss-Newton Hessian a point must keep with the kernel's whole curvature for Newton's step to use it,
 and below which the point also takes steps of its own. The first: .01, .05 and .3 take 6, 6 and 8 steps where no point
