@@ -225,6 +225,21 @@ def test_keyframes_that_others_overlap_are_left_out(
     assert [view.index for view in map_whole(WALK, results=results).views] == chosen
 
 
+def test_frames_that_cannot_be_read_are_passed_over(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Damaged(Walk):
+        def image(self, index: int) -> Tensor:
+            if index in (2, 8, 15):
+                raise FrameError(f"image {index} is damaged")
+            return super().image(index)
+
+    monkeypatch.setattr("torchslam.global_mapping.mapper.ENOUGH_SHARED", 1000)
+    monkeypatch.setattr("torchslam.global_mapping.mapper.FEW_IMAGES", 29)
+    with pytest.warns(UserWarning, match="damaged"):
+        made = map_whole(Damaged(walk_arc(30)), "global_mapping.window_images=30")
+    assert [view.index for view in made.views] == [index for index in range(30) if index not in (2, 8, 15)]
+    assert len(made.run.skipped) == 3
+
+
 def test_doubtful_frames_of_an_online_run_are_mapped() -> None:
     """And each frame is read and its features are extracted once."""
 

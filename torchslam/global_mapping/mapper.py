@@ -487,15 +487,19 @@ class GlobalMapper:
                 for row, gap in enumerate(gaps)
                 if gap not in tried and (middle := _middle(images, *gap, among)) is not None
             }
-            tried |= {gaps[row] for row in middles}
+            if not middles:
+                break
             overlap = self._overlap(
                 views,
                 {row: ENOUGH_SHARED if middle in images else LEAST_SHARED for row, middle in middles.items()},
             )
             more = [middle for row, middle in middles.items() if row not in overlap]
-            if not more:
-                break
-            views = sorted(views + self._saved_views(more), key=lambda view: view.index)
+            found = self._saved_views(more)
+            views = sorted(views + found, key=lambda view: view.index)
+            # In place of an image that cannot be read, the next ones are tried.
+            unread = set(images) & (set(more) - {view.index for view in found})
+            images = [image for image in images if image not in unread]
+            tried |= {gaps[row] for row, middle in middles.items() if middle not in unread}
         return views
 
     def _overlap(self, views: list[FrameFeatures], least: dict[int, int]) -> set[int]:

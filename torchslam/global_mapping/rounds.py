@@ -65,7 +65,7 @@ MIN_SHARED = 5
 point where their own rays allow it: on office_loop such a part had one; right weak links there have 16 and more."""
 MAX_ROUNDS, MIN_CHANGE = 4, 0.03
 """Fine rounds go on until less than this share of the observations changes sides. The final adjustment follows: with
-.005 and one more round, twelve recordings and parts end at the same errors (within 2 %)."""
+.005 and one more round, eleven recordings and parts end at the same errors (within 3 %)."""
 
 
 @dataclass(frozen=True)

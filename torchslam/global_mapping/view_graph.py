@@ -1,6 +1,6 @@
 """The view graph: pairs of images that see the same, with their verified matches and relative poses.
 
-Pairs are neighbors in time, the nearest ones always, others where nearer ones held, and images of similar places.
+Pairs are neighbors in time, near ones always, far ones where nearer ones held, and images of similar places.
 """
 
 from __future__ import annotations
@@ -10,7 +10,6 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from enum import Enum
 from functools import cached_property, partial
-from itertools import pairwise
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -27,10 +26,9 @@ from torchslam.tracking.matcher import DescriptorMatcher, max_distance, run_matc
 from torchslam.types import FrameFeatures, Matcher, MatchIndices
 from torchslam.utils.indexing import connected_parts
 
-NEAR, NEAREST = (1, 2, 3, 5, 8), 3
-"""Distances in images at which neighbors in time are matched, and up to which all are: a blurred image breaks no chain.
-On garden all of 1 to 8 give the same poses, for half more time. `near_pairs` leaves out a quarter of the pairs of
-courthouse at 5 and 8, of which 5 % hold, and 7 % of those of office_loop."""
+NEAR = 1, 2, 3, 5, 8
+"""Distances in images at which all neighbors in time are matched: a blurred image breaks no chain. On garden all of 1
+to 8 give the same poses, for half more time."""
 FAR = 16
 """Distance from which on, doubling, neighbors are matched where those at the distance before held."""
 PLACES = 2
@@ -249,7 +247,8 @@ def build_view_graph(
     pairs: list[ViewPair] = []
     for done, start in enumerate(groups):
         progress(done, steps)
-        pairs += near_pairs(range(start, min(start + _IMAGES_AT_ONCE, count)), count, find)
+        rows = range(start, min(start + _IMAGES_AT_ONCE, count))
+        pairs += find((row, row + distance) for row in rows for distance in NEAR if row + distance < count)
     held = [pair.first for pair in pairs if pair.second - pair.first == NEAR[-1]]
     for done, distance in enumerate(far, len(groups)):
         progress(done, steps)
@@ -260,31 +259,6 @@ def build_view_graph(
     known = {(pair.first, pair.second) for pair in pairs}
     pairs += find(pair for pair in similar_places(matcher.views) if pair not in known)
     return sorted(pairs, key=lambda pair: (pair.first, pair.second))
-
-
-def near_pairs(
-    rows: range, count: int, find: Callable[[Iterable[tuple[int, int]]], list[ViewPair]]
-) -> list[ViewPair]:
-    """The pairs of some of `count` images with later neighbors that hold.
-
-    Beyond `NEAREST`, two images are matched where, at the distance before, the first one holds with one before the
-    second, or one after the first with the second: what is out of sight is not tried again.
-    """
-    pairs: list[ViewPair] = []
-    held: set[tuple[int, int]] = set()
-
-    def is_likely(row: int, before: int, distance: int) -> bool:
-        later = row + distance - before
-        return later not in rows or not held.isdisjoint({(row, row + before), (later, row + distance)})
-
-    for before, distance in pairwise((0, *NEAR)):
-        chosen = [row for row in rows if row + distance < count]
-        if distance > NEAREST:
-            chosen = [row for row in chosen if is_likely(row, before, distance)]
-        found = find((row, row + distance) for row in chosen)
-        held = {(pair.first, pair.second) for pair in found}
-        pairs += found
-    return pairs
 
 
 def similar_places(views: list[FrameFeatures]) -> list[tuple[int, int]]:
