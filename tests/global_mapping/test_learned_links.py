@@ -54,7 +54,7 @@ TIED = with_learned(VIEWS, {row: LEARNED[row] for row in NEAR}, ACROSS)
 
 def tracks_of(*pairs: LearnedPairs) -> Tracks:
     every = [pair for each in pairs for pair in each.pairs]
-    return join_matches(every, COUNT, len(pairs[0].views[0].mask))
+    return join_matches(every, COUNT, max(len(view.mask) for view in pairs[0].views))
 
 
 def test_keypoints_are_appended_and_pairs_point_to_them() -> None:
@@ -73,8 +73,6 @@ def test_keypoints_are_appended_and_pairs_point_to_them() -> None:
 
 
 def test_keypoints_of_an_image_stay() -> None:
-    lengths = {len(view.mask) for view in TIED.views}
-    assert len(lengths) == 1
     for row, (before, after) in enumerate(zip(VIEWS, TIED.views, strict=True)):
         was = before.mask
         for name in ("keypoints", "detected", "scales", "angles", "descriptors", "information"):
@@ -82,6 +80,7 @@ def test_keypoints_of_an_image_stay() -> None:
             assert torch.equal(new[: len(was)][was], old[was]), name
         added = int(after.mask.sum() - was.sum())
         assert (added > 0) == (row in NEAR)
+        assert len(after.mask) == max(len(was), int(was.nonzero().amax()) + 1 + added)
         matched = {
             int(at)
             for pair in ACROSS
