@@ -83,12 +83,12 @@ LEAST_SHARED, HALVINGS = 200, 2
 is halved so. Keyframes of machine_hall have 637 in the median, those of office_loop, mapped alone, lose its loop."""
 ENOUGH_SHARED = 400
 """Verified matches of neighbors from which on frames or keyframes between them are left out. With 200 the error of
-garden doubles."""
+garden doubles; tried at these two values."""
 FEW_IMAGES = 40
-"""Frames or keyframes up to which all are mapped; of more, those that overlap by so much."""
+"""Frames or keyframes up to which all are mapped; of more, those that overlap by so much. Tried at this value only."""
 SAMPLE, LEAST_OVERLAP = 12, 0.25
 """Pairs of neighbors that are matched first, and the share of them that must have so many matches: else all neighbors
-count as too far apart, and no more of them are matched."""
+count as too far apart, and no more of them are matched. Tried at these values only."""
 SAVED_TOGETHER = 50
 """Images whose features are saved in one file of up to 80 MB. As many, some seconds of work, are lost if a run is
 killed. Tried at this value only."""
