@@ -24,11 +24,11 @@ from torchslam.geometry import se3_inverse, so3_exp
 from torchslam.geometry.camera_measurement import CameraMeasurement
 from torchslam.global_mapping.check import check_map
 from torchslam.global_mapping.coarse import CoarseMap, CoarseMapper
+from torchslam.global_mapping.image_choice import choose_images
 from torchslam.global_mapping.mapper import (
     GlobalMap,
     GlobalMapper,
     choose_held_back,
-    choose_images,
     mapping_config,
     poses_of,
 )
@@ -175,7 +175,7 @@ def test_frames_between_keyframes_that_share_too_little_are_mapped(
     monkeypatch: pytest.MonkeyPatch, enough: int, chosen: list[int]
 ) -> None:
     """Twice as close, and twice again; images have 200 keypoints."""
-    monkeypatch.setattr("torchslam.global_mapping.mapper.LEAST_SHARED", enough)
+    monkeypatch.setattr("torchslam.global_mapping.image_choice.LEAST_SHARED", enough)
     results = [result(index, State.TRACKING, index in (0, 8, 16, 24)) for index in range(30)]
     assert [view.index for view in map_whole(WALK, results=results).views] == chosen
 
@@ -189,10 +189,10 @@ def test_frames_of_short_recordings_are_mapped_where_fewer_share_too_little(
     monkeypatch: pytest.MonkeyPatch, enough: int, chosen: list[int]
 ) -> None:
     """Every fourth, or else every second, or else every one; all of very few."""
-    monkeypatch.setattr("torchslam.global_mapping.mapper.ENOUGH_SHARED", enough)
+    monkeypatch.setattr("torchslam.global_mapping.image_choice.ENOUGH_SHARED", enough)
     whole = "global_mapping.window_images=30"
     assert [view.index for view in map_whole(WALK, whole).views] == list(range(30))
-    monkeypatch.setattr("torchslam.global_mapping.mapper.FEW_IMAGES", 29)
+    monkeypatch.setattr("torchslam.global_mapping.image_choice.FEW_IMAGES", 29)
     tried, match = list[int](), PairMatcher.match
 
     def counted(self: PairMatcher, pairs: Iterable[tuple[int, int]]) -> list[ViewPair]:
@@ -201,7 +201,7 @@ def test_frames_of_short_recordings_are_mapped_where_fewer_share_too_little(
         return match(self, pairs)
 
     monkeypatch.setattr(PairMatcher, "match", counted)
-    monkeypatch.setattr("torchslam.global_mapping.mapper.SAMPLE", 3)
+    monkeypatch.setattr("torchslam.global_mapping.image_choice.SAMPLE", 3)
     found = map_whole(WALK, whole)
     assert [view.index for view in found.views] == chosen
     assert len(found.run.trajectory) == 30
@@ -218,9 +218,9 @@ def test_keyframes_that_others_overlap_are_left_out(
     monkeypatch: pytest.MonkeyPatch, enough: int, chosen: list[int]
 ) -> None:
     """And frames between them where even they share too little."""
-    monkeypatch.setattr("torchslam.global_mapping.mapper.LEAST_SHARED", enough)
-    monkeypatch.setattr("torchslam.global_mapping.mapper.ENOUGH_SHARED", enough)
-    monkeypatch.setattr("torchslam.global_mapping.mapper.FEW_IMAGES", 8)
+    monkeypatch.setattr("torchslam.global_mapping.image_choice.LEAST_SHARED", enough)
+    monkeypatch.setattr("torchslam.global_mapping.image_choice.ENOUGH_SHARED", enough)
+    monkeypatch.setattr("torchslam.global_mapping.image_choice.FEW_IMAGES", 8)
     results = [result(index, State.TRACKING, index % 3 == 0 and index < 25) for index in range(30)]
     assert [view.index for view in map_whole(WALK, results=results).views] == chosen
 
@@ -232,8 +232,8 @@ def test_frames_that_cannot_be_read_are_passed_over(monkeypatch: pytest.MonkeyPa
                 raise FrameError(f"image {index} is damaged")
             return super().image(index)
 
-    monkeypatch.setattr("torchslam.global_mapping.mapper.ENOUGH_SHARED", 1000)
-    monkeypatch.setattr("torchslam.global_mapping.mapper.FEW_IMAGES", 29)
+    monkeypatch.setattr("torchslam.global_mapping.image_choice.ENOUGH_SHARED", 1000)
+    monkeypatch.setattr("torchslam.global_mapping.image_choice.FEW_IMAGES", 29)
     with pytest.warns(UserWarning, match="damaged"):
         made = map_whole(Damaged(walk_arc(30)), "global_mapping.window_images=30")
     assert [view.index for view in made.views] == [index for index in range(30) if index not in (2, 8, 15)]

@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 import warnings
-from bisect import bisect_left, bisect_right
 from collections.abc import Callable, Collection, Iterable, Iterator
 from collections.abc import Sequence as Rows
 from dataclasses import dataclass, replace
 from functools import partial
-from itertools import pairwise
-from statistics import median
 
 import torch
 from jaxtyping import Float, Int
@@ -24,6 +21,7 @@ from torchslam.geometry.rolling_shutter import Readout
 from torchslam.global_mapping.check import MapCheck, check_map
 from torchslam.global_mapping.coarse import CoarseMap, CoarseMapper
 from torchslam.global_mapping.frames_between import FollowedViews, pose_frames
+from torchslam.global_mapping.image_choice import choose_images, overlapping_views
 from torchslam.global_mapping.links import (
     MIN_LEARNED_MATCHES,
     LearnedPairs,
@@ -78,17 +76,6 @@ HELD_BACK = 10
 """One in this many verified pairs is held out from mapping, for the check of the map."""
 HELD_BACK_DISTANCE = 2
 """Least distance in images of pairs that are held back: pairs of neighbors keep the images together."""
-LEAST_SHARED, HALVINGS = 200, 2
-"""Verified matches that neighbors must have, or else a frame between them is mapped as well, and how often the distance
-is halved so. Keyframes of machine_hall have 637 in the median, those of office_loop, mapped alone, lose its loop."""
-ENOUGH_SHARED = 400
-"""Verified matches of neighbors from which on frames or keyframes between them are left out. With 200 the error of
-garden doubles; tried at these two values."""
-FEW_IMAGES = 40
-"""Frames or keyframes up to which all are mapped; of more, those that overlap by so much. Tried at this value only."""
-SAMPLE, LEAST_OVERLAP = 12, 0.25
-"""Pairs of neighbors that are matched first, and the share of them that must have so many matches: else all neighbors
-count as too far apart, and no more of them are matched. Tried at these values only."""
 SAVED_TOGETHER = 50
 """Images whose features are saved in one file of up to 80 MB. As many, some seconds of work, are lost if a run is
 killed. Tried at this value only."""
@@ -168,30 +155,6 @@ def features_to_keep(
     return KeptFeatures(image_extractor(mapping, device))
 
 
-def choose_images(count: int, results: Rows[StepResult], most: int) -> list[int]:
-    """The frames that may be mapped: all of a short recording, else by what they have in common.
-
-    The keyframes of an online run overlap as they should; without any, frames are spread evenly. Where the run was lost
-    or uncertain, frames follow each other twice as fast as these do.
-
-    Args:
-        count: the number of frames.
-        results: of an online run.
-        most: frames of a recording that is short, or that are spread evenly.
-    """
-    keyframes = sorted({result.index for result in results if result.is_keyframe})
-    if count <= most or len(keyframes) < MIN_VIEWS:
-        keyframes = list(range(0, count, -(-count // most)))
-    gap = median(after - before for before, after in pairwise([*keyframes, count]))
-    chosen, last = set(keyframes), -count
-    for result in results:
-        is_doubtful = result.state in (State.LOST, State.UNCERTAIN)
-        if is_doubtful and gap / 2 <= result.index - last and result.index < count:
-            chosen.add(result.index)
-            last = result.index
-    return sorted(chosen)
-
-
 class GlobalMapper:
     """Maps the frames of a recording, all at once.
 
@@ -254,7 +217,8 @@ class GlobalMapper:
                 "global_mapping.learned_links requires images; the recording has precomputed features"
             )
         images = choose_images(len(self.sequence), results, self.config.global_mapping.window_images)
-        views = self._overlapping(images, any(result.is_keyframe for result in results))
+        has_keyframes = any(result.is_keyframe for result in results)
+        views = overlapping_views(images, self._saved_views, self._neighbors, has_keyframes)
         if before is not None:
             views, self.readout = before.at_middle_row(views), before.readout
         if len(views) < MIN_VIEWS:
@@ -472,51 +436,10 @@ class GlobalMapper:
             read_zoom=self.sequence.zoom,
         )
 
-    def _overlapping(self, images: list[int], among: bool) -> list[FrameFeatures]:
-        """The views of every few of the images, and of those between neighbors that have too few verified matches.
-
-        among: where even neighbors of the images have too few, also of frames between them
-        """
-        halvings = 0 if len(images) <= FEW_IMAGES else HALVINGS
-        views = self._saved_views(sorted({*images[:: 2**halvings], *images[-1:]}))
-        tried = set[tuple[int, int]]()
-        for _ in range(halvings + HALVINGS):
-            gaps = [(before.index, after.index) for before, after in pairwise(views)]
-            middles = {
-                row: middle
-                for row, gap in enumerate(gaps)
-                if gap not in tried and (middle := _middle(images, *gap, among)) is not None
-            }
-            if not middles:
-                break
-            overlap = self._overlap(
-                views,
-                {row: ENOUGH_SHARED if middle in images else LEAST_SHARED for row, middle in middles.items()},
-            )
-            more = [middle for row, middle in middles.items() if row not in overlap]
-            found = self._saved_views(more)
-            views = sorted(views + found, key=lambda view: view.index)
-            # In place of an image that cannot be read, the next ones are tried.
-            unread = set(images) & (set(more) - {view.index for view in found})
-            images = [image for image in images if image not in unread]
-            tried |= {gaps[row] for row, middle in middles.items() if middle not in unread}
-        return views
-
-    def _overlap(self, views: list[FrameFeatures], least: dict[int, int]) -> set[int]:
-        """The rows of views that have at least so many verified matches with the next one; none where hardly any of a
-        sample of them do."""
+    def _neighbors(self, views: list[FrameFeatures], rows: list[int]) -> list[ViewPair]:
+        """The pairs of views and the next ones that hold, of some rows."""
         matcher = PairMatcher(views, self.camera, self.matcher, self.config)
-
-        def among(rows: list[int]) -> set[int]:
-            pairs = self.saved.pairs(matcher, ((row, row + 1) for row in rows))
-            return {pair.first for pair in pairs if len(pair) >= least[pair.first]}
-
-        rows = sorted(least)
-        sample = rows[:: max(1, len(rows) // SAMPLE)]
-        found = among(sample)
-        if len(found) < LEAST_OVERLAP * len(sample):
-            return set()
-        return found | among(sorted(set(rows) - set(sample)))
+        return self.saved.pairs(matcher, ((row, row + 1) for row in rows))
 
     def _saved_views(self, images: list[int]) -> list[FrameFeatures]:
         """The features of the images that can be read, saved in groups."""
@@ -623,14 +546,6 @@ def known_poses(run: Run, certain: Collection[int], views: list[FrameFeatures]) 
     T_cw, is_posed = poses_of(run, views)
     is_certain = torch.tensor([view.index in certain for view in views], dtype=torch.bool, device="cpu")
     return KnownPoses(T_cw, is_posed & is_certain, run.camera)
-
-
-def _middle(images: list[int], before: int, after: int, among: bool) -> int | None:
-    """The middle one of the images between two frames; among: else the frame in the middle, if there is one."""
-    between = images[bisect_right(images, before) : bisect_left(images, after)]
-    if between:
-        return between[len(between) // 2]
-    return (before + after) // 2 if among and after - before > 1 else None
 
 
 def choose_held_back(pairs: list[ViewPair]) -> frozenset[int]:

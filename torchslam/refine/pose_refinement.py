@@ -36,7 +36,8 @@ from torchslam.geometry.robust import fit_inliers
 from torchslam.geometry.similarity import align_poses
 from torchslam.geometry.transforms import opengl, rotation_angle
 from torchslam.global_mapping.check import MapCheck, check_map
-from torchslam.global_mapping.mapper import GlobalMapper, choose_held_back, choose_images
+from torchslam.global_mapping.image_choice import choose_images
+from torchslam.global_mapping.mapper import GlobalMapper, choose_held_back
 from torchslam.global_mapping.rounds import GATE, MIN_VIEWS, ObservedTracks, Reconstruction, adjust_in_rounds
 from torchslam.global_mapping.view_graph import (
     PairMatcher,
