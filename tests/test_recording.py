@@ -12,6 +12,7 @@ import torchslam
 from tests.walks import Walk, arc
 from torchslam import SLAM, Frame, State, StepResult, load_config, recording
 from torchslam.data.sequence import Calibrated
+from torchslam.global_mapping.mapper import GlobalMap, GlobalMapper
 from torchslam.global_mapping.recording import Mapping
 from torchslam.map.unit import MetricUnit
 from torchslam.metric.source import ScaleMeasurement, ScaleSource, SubmapView
@@ -58,6 +59,31 @@ def test_a_lost_recording_is_mapped_as_a_whole(monkeypatch: pytest.MonkeyPatch) 
     assert len(run.trajectory) == FRAMES > len(run.online)
     online = torchslam.run(WALK, CONFIG, mapping="online")
     assert (online.kept, online.by_frame, len(online.results)) == (Mapping.ONLINE, None, FRAMES)
+
+
+def test_a_recording_that_is_to_be_mapped_as_a_whole_is_not_processed_frame_by_frame() -> None:
+    """But where it is so long that frames which are spread evenly may not overlap: then keyframes are mapped."""
+    seen: list[int] = []
+    observer = Observer(lambda result: seen.append(result.index))
+    run = torchslam.run(WALK, CONFIG, mapping="global", observer=observer)
+    assert (run.kept, run.why, seen) == (Mapping.GLOBAL, "it was asked for", [])
+    assert run.by_frame is not None
+    assert run.by_frame.results == []
+    assert (len(run.trajectory), len(run.online), run.failure) == (FRAMES, 0, "")
+    config = replace(CONFIG, global_mapping=replace(CONFIG.global_mapping, window_images=4))
+    torchslam.run(WALK, config, mapping="global", observer=observer)
+    assert seen == list(range(FRAMES))
+
+
+def test_frames_are_processed_where_the_map_of_the_whole_is_not_right(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def fail(mapper: GlobalMapper, *_: Any) -> GlobalMap:
+        return mapper._failed("no map", [], [])
+
+    monkeypatch.setattr(GlobalMapper, "run", fail)
+    run = torchslam.run(WALK, CONFIG, mapping="global")
+    assert (run.kept, run.why, len(run.trajectory)) == (Mapping.ONLINE, "it was asked for", FRAMES)
 
 
 def test_an_interrupt_keeps_what_there_is() -> None:

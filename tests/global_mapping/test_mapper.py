@@ -24,7 +24,7 @@ from torchslam.geometry import se3_inverse, so3_exp
 from torchslam.geometry.camera_measurement import CameraMeasurement
 from torchslam.global_mapping.check import check_map
 from torchslam.global_mapping.coarse import CoarseMap, CoarseMapper
-from torchslam.global_mapping.image_choice import choose_images
+from torchslam.global_mapping.image_choice import choose_images, needs_keyframes
 from torchslam.global_mapping.mapper import (
     GlobalMap,
     GlobalMapper,
@@ -47,8 +47,8 @@ def config(*overrides: str) -> Config:
         None,
         [
             "features.kind=simulated",
-            "features.num_keypoints=200",
-            "simulated.points_per_view=120",
+            "features.num_keypoints=300",
+            "simulated.points_per_view=280",
             "simulated.depth_near=0.6",
             "simulated.depth_far=2",
             "simulated.noise_px=0.1",
@@ -85,6 +85,12 @@ def result(index: int, state: State, is_keyframe: bool = False) -> StepResult:
 )
 def test_images_are_spread_evenly(count: int, most: int, chosen: list[int]) -> None:
     assert choose_images(count, [], most) == chosen
+
+
+def test_long_recordings_need_keyframes() -> None:
+    """Of up to four times as many frames as are spread evenly, those between neighbors are tried down to every one."""
+    assert not needs_keyframes(1200, 300)
+    assert needs_keyframes(1201, 300)
 
 
 def test_images_of_long_recordings_are_keyframes_and_doubtful_frames() -> None:
@@ -507,11 +513,14 @@ def test_a_part_that_nothing_ties_to_the_map_is_lost() -> None:
     # A scene around the walk only, not around the distance between both parts.
     scene = Simulated(settings, walk.camera, se3_inverse(T_wc[:20]))
     made = GlobalMapper(scene.of(walk), walk.camera, settings, None).run()
-    assert [view.index for view in made.views] == list(range(0, 26, 2))
+    assert [view.index for view in made.views] == [
+        *range(0, 20, 2),
+        *range(19, 25),
+    ]  # all where they do not overlap
     assert len(made.run.trajectory) == 20
-    assert made.run.map.num_keyframes == 10
+    assert made.run.map.num_keyframes == 11
     assert [each.state for each in made.run.results] == [State.TRACKING] * 20 + [State.LOST] * 6
-    assert poses_of(made.run, made.views)[1].tolist() == [True] * 10 + [False] * 3
+    assert poses_of(made.run, made.views)[1].tolist() == [True] * 11 + [False] * 5
     assert walk.groundtruth is not None
     assert evaluate(made.run.trajectory, walk.groundtruth).ate_m < 2e-3
 

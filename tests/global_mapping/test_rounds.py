@@ -12,10 +12,17 @@ import torch
 from torch import Tensor
 
 from tests.global_mapping.synthetic import CAMERA, EYE, SIGMA_PX, Recording, apart, arc, ball, disturbed, line
-from torchslam.geometry import Camera, KeypointNoise, transform
+from torchslam.geometry import Camera, KeypointNoise, se3_inverse, transform
 from torchslam.geometry.camera_measurement import CameraMeasurement
 from torchslam.global_mapping import rounds
-from torchslam.global_mapping.rounds import COARSE, ObservedTracks, Reconstruction, adjust, adjust_in_rounds
+from torchslam.global_mapping.rounds import (
+    COARSE,
+    FINE,
+    ObservedTracks,
+    Reconstruction,
+    adjust,
+    adjust_in_rounds,
+)
 from torchslam.global_mapping.tracks import Tracks
 from torchslam.optim import BundleProblem
 
@@ -276,10 +283,24 @@ def test_the_problem_has_the_noise_and_the_camera(monkeypatch: pytest.MonkeyPatc
     measured = CameraMeasurement.of(CAMERA, 0.02)
     adjust(observed, replace(found, camera=measured.camera), "cauchy", 6.0, 1e-3, measured)
     ((problem, free),) = calls
-    torch.testing.assert_close(problem.weights, 4 / scales[SCENE.tracks.keypoint[found.agrees]] ** 2)
-    assert torch.equal(free, measured.directions)
+    weights = 4 / scales[SCENE.tracks.keypoint[found.agrees]] ** 2
+    torch.testing.assert_close(problem.weights, weights.float())
+    assert torch.equal(free, measured.directions.float())
     assert problem.camera_prior is not None
-    assert torch.equal(problem.camera_prior.params, measured.camera.params)
+    assert torch.equal(problem.camera_prior.params, measured.camera.params.float())
+
+
+def test_poses_far_from_the_origin_are_adjusted_as_well() -> None:
+    """As in coordinates of a map grid, 1,000 km away: they lose what float64 loses, and nothing to float32."""
+    away = torch.eye(4, dtype=torch.float64)
+    away[:3, 3] = torch.tensor((4e5, 5e6, 300.0))
+    near = replace(exact(NOISY), agrees=RIGHT)
+    far = replace(near, T_cw=near.T_cw @ se3_inverse(away), points_w=near.points_w + away[:3, 3])
+    here, there = (adjust(NOISY.observed, found, *FINE, 1e-8, None) for found in (near, far))
+    torch.testing.assert_close(there.T_cw @ away, here.T_cw, rtol=0, atol=1e-4)
+    torch.testing.assert_close(there.points_w - away[:3, 3], here.points_w, rtol=0, atol=1e-3)
+    R_cw = there.T_cw[:, :3, :3]
+    torch.testing.assert_close(R_cw @ R_cw.mT, torch.eye(3).double().expand_as(R_cw), rtol=0, atol=1e-12)
 
 
 # --- all rounds ------------------------------------------------------------------------------------------------

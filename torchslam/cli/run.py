@@ -109,7 +109,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         choices=[each.value for each in Mapping],
         default=Mapping.AUTO.value,
         help="auto: frame by frame, and then as a whole if frames were lost or image pairs contradict the map; "
-        "online: frame by frame alone; global: always as a whole as well (default: %(default)s)",
+        "online: frame by frame alone; global: as a whole in any case (default: %(default)s)",
     )
     parser.add_argument(
         "--dense", action="store_true", help="compute dense depth after the run, as `torchslam densify` does"

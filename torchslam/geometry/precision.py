@@ -75,8 +75,8 @@ def in_widest_precision(function: Callable[P, R]) -> Callable[P, R]:
         if len(found) < 2 and found <= set(_FLOATS):
             return function(*args, **kwargs)
         dtype = torch.float32 if torch.float32 in found and torch.float64 not in found else torch.float64
-        args = tuple(_in_dtype(value, dtype) for value in args)  # type: ignore[assignment]
-        kwargs = {name: _in_dtype(value, dtype) for name, value in kwargs.items()}  # type: ignore[assignment]
+        args = tuple(in_dtype(value, dtype) for value in args)  # type: ignore[assignment]
+        kwargs = {name: in_dtype(value, dtype) for name, value in kwargs.items()}  # type: ignore[assignment]
         return function(*args, **kwargs)
 
     return widened
@@ -95,17 +95,17 @@ def _dtypes_in(value: Any) -> Iterator[torch.dtype]:
             yield from _dtypes_in(getattr(value, each.name))
 
 
-def _in_dtype(value: Any, dtype: torch.dtype) -> Any:
-    """A value with the tensors that `_dtypes_in` counts in another type."""
+def in_dtype(value: Any, dtype: torch.dtype) -> Any:
+    """A value with the tensors of floats in it, its fields and its elements in another type; cameras follow."""
     if isinstance(value, Tensor):
         return value.to(dtype) if value.is_floating_point() and value.ndim else value
     if type(value) in (list, tuple):
-        return type(value)(_in_dtype(each, dtype) for each in value)
+        return type(value)(in_dtype(each, dtype) for each in value)
     if getattr(value, "follows_data", False):
         return _following(value, dtype)
     if not is_dataclass(value) or isinstance(value, type) or not any(_dtypes_in(value)):
         return value
-    changed = {each.name: _in_dtype(getattr(value, each.name), dtype) for each in fields(value)}
+    changed = {each.name: in_dtype(getattr(value, each.name), dtype) for each in fields(value)}
     return replace(value, **changed)
 
 

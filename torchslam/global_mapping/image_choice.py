@@ -14,7 +14,7 @@ from torchslam.types import FrameFeatures, State, StepResult
 
 LEAST_SHARED, HALVINGS = 200, 2
 """Verified matches that neighbors must have, or else a frame between them is mapped as well, and how often the distance
-is halved so. Keyframes of machine_hall have 637 in the median, those of office_loop, mapped alone, lose its loop."""
+is halved so at most. Keyframes of machine_hall have 637 in the median, those of office_loop, mapped alone, lose its loop."""
 ENOUGH_SHARED = 400
 """Verified matches of neighbors from which on frames or keyframes between them are left out. With 200 the error of
 garden doubles; tried at these two values."""
@@ -25,6 +25,14 @@ SAMPLE, LEAST_OVERLAP = 12, 0.25
 count as too far apart, and no more of them are matched. Tried at these values only."""
 Neighbors = Callable[[list[FrameFeatures], list[int]], list[ViewPair]]
 """Finds, of some rows of views, the pairs with the next view that hold."""
+
+
+def needs_keyframes(count: int, most: int) -> bool:
+    """Whether frames of a recording of so many that are spread evenly, at most so many, may miss what they overlap in.
+
+    With every frame between neighbors that `overlapping_views` may add, shorter ones have all that there is.
+    """
+    return count > most << HALVINGS
 
 
 def choose_images(count: int, results: Rows[StepResult], most: int) -> list[int]:
@@ -52,15 +60,14 @@ def choose_images(count: int, results: Rows[StepResult], most: int) -> list[int]
 
 
 def overlapping_views(
-    images: list[int], read: Callable[[list[int]], list[FrameFeatures]], match: Neighbors, among: bool
+    images: list[int], read: Callable[[list[int]], list[FrameFeatures]], match: Neighbors
 ) -> list[FrameFeatures]:
-    """The views of every few of the images, and of those between neighbors that have too few verified matches.
+    """The views of every few of the images, and of those, or of frames, between neighbors with too few verified matches.
 
     Args:
         images: frames, ascending.
         read: returns the views of those of some frames that can be read.
         match: matches neighbors.
-        among: where even neighbors of the images have too few, also frames between them are read.
     """
     halvings = 0 if len(images) <= FEW_IMAGES else HALVINGS
     views, tried = read(sorted({*images[:: 2**halvings], *images[-1:]})), set[tuple[int, int]]()
@@ -69,7 +76,7 @@ def overlapping_views(
         middles = {
             row: middle
             for row, gap in enumerate(gaps)
-            if gap not in tried and (middle := _middle(images, *gap, among)) is not None
+            if gap not in tried and (middle := _middle(images, *gap)) is not None
         }
         if not middles:
             break
@@ -85,12 +92,12 @@ def overlapping_views(
     return views
 
 
-def _middle(images: list[int], before: int, after: int, among: bool) -> int | None:
-    """The middle one of the images between two frames; among: else the frame in the middle, if there is one."""
+def _middle(images: list[int], before: int, after: int) -> int | None:
+    """The middle one of the images between two frames, else the frame in the middle, if there is one."""
     between = images[bisect_right(images, before) : bisect_left(images, after)]
     if between:
         return between[len(between) // 2]
-    return (before + after) // 2 if among and after - before > 1 else None
+    return (before + after) // 2 if after - before > 1 else None
 
 
 def _overlap(views: list[FrameFeatures], least: dict[int, int], match: Neighbors) -> set[int]:

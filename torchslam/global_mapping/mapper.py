@@ -217,8 +217,7 @@ class GlobalMapper:
                 "global_mapping.learned_links requires images; the recording has precomputed features"
             )
         images = choose_images(len(self.sequence), results, self.config.global_mapping.window_images)
-        has_keyframes = any(result.is_keyframe for result in results)
-        views = overlapping_views(images, self._saved_views, self._neighbors, has_keyframes)
+        views = overlapping_views(images, self._saved_views, self._neighbors)
         if before is not None:
             views, self.readout = before.at_middle_row(views), before.readout
         if len(views) < MIN_VIEWS:

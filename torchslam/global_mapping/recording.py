@@ -15,6 +15,7 @@ from torchslam.data.sequence import Sequence
 from torchslam.geometry import Camera
 from torchslam.geometry.camera_measurement import CameraMeasurement
 from torchslam.global_mapping.check import MapCheck, check_map
+from torchslam.global_mapping.image_choice import needs_keyframes
 from torchslam.global_mapping.mapper import GlobalMapper, Progress, poses_of
 from torchslam.global_mapping.saved_stages import SavedStages
 from torchslam.global_mapping.view_graph import FAR, PairMatcher, ViewPair, similar_places
@@ -44,6 +45,8 @@ MOST_AGAIN = 2
 Tried at 1 and 2."""
 UNMEASURED = "interrupted; `torchslam align` measures later"
 """Why an interrupted run has an arbitrary unit."""
+ASKED_FOR = "it was asked for"
+"""Why a recording is mapped as a whole of which nothing was lost."""
 KeyframePairs = tuple[list[FrameFeatures], list[ViewPair]]
 """Features of keyframes, and their verified pairs."""
 
@@ -56,7 +59,7 @@ class Mapping(StrEnum):
     ONLINE = "online"
     """Frame by frame, in the order of time."""
     GLOBAL = "global"
-    """As a whole as well, whatever the result of the check."""
+    """As a whole, and online first where the recording is long, or then where that map is not right."""
 
 
 @dataclass(frozen=True)
@@ -162,10 +165,18 @@ def _mapped(
     may_end: whether a zoom that is found in the frames ends it
     """
     config, observer = online.slam.config, online.observer
-    length = sequence.known_length
-    are_all_mapped = length is not None and length <= config.global_mapping.window_images
-    may_map = mapping in (Mapping.AUTO, Mapping.GLOBAL)
-    run = MappedRun.of(online.run(until_lost=may_map and are_all_mapped and not all_frames))
+    length, most = sequence.known_length, config.global_mapping.window_images
+    if (
+        mapping is Mapping.GLOBAL
+        and length is not None
+        and not needs_keyframes(length, most)
+        and not all_frames
+    ):
+        begun = online.begun
+    else:
+        are_all_mapped = mapping is Mapping.AUTO and length is not None and length <= most
+        begun = online.run(until_lost=are_all_mapped and not all_frames)
+    run = MappedRun.of(begun)
     if mapping is None or run.interrupted or (may_end and _is_zoomed(run)):
         return run
     go_on = None if online.is_finished else online.run
@@ -240,7 +251,10 @@ def map_recording(
     if mapping is Mapping.AUTO and stands_still(online.results):
         return MappedRun.of(online, Mapping.ONLINE)
     check, camera = None, camera.to(device)
-    why = _loss(online) if go_on is None else f"tracking was lost at frame {online.results[-1].index}"
+    why = _loss(online)
+    if go_on is not None:
+        was_lost = mapping is not Mapping.GLOBAL
+        why = f"tracking was lost at frame {online.results[-1].index}" if was_lost else ASKED_FOR
     is_long = len(online.results) > config.global_mapping.window_images
     if not why or mapping is Mapping.ONLINE or is_long:
         progress("check", 0, 1)
@@ -293,7 +307,7 @@ def map_recording(
         is_better = gain.total > 0
     elif whole.is_right and not before.is_right:
         is_better = posed >= FEW_POSED * before_posed
-    why = why or "it was asked for"
+    why = why or ASKED_FOR
     if is_better:
         return MappedRun.of(made.run, Mapping.GLOBAL, whole, why, online)
     return MappedRun.of(online, Mapping.ONLINE, before, why)

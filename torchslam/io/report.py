@@ -35,7 +35,7 @@ def compute_metrics(
     """
 
     def measured(run: Run, measure: Callable[[Trajectory], Errors]) -> Errors | None:
-        if sequence.groundtruth is None or run.failure:
+        if sequence.groundtruth is None or run.failure or not run.results:
             return None
         try:
             return measure(sequence.groundtruth)

@@ -135,6 +135,14 @@ class OnlineRun:
         """Whether all frames were processed, or the run was ended."""
         return self._finished is not None
 
+    @property
+    def begun(self) -> Run:
+        """The run of the frames so far, unadjusted."""
+        slam, so_far = self.slam, self.so_far
+        sensor, maps = slam.shared_camera.model, tuple(slam.session.atlas)
+        results, skipped = list(so_far.results), list(so_far.skipped)
+        return Run(maps, sensor, slam.config, results, skipped, False, failure="", read_zoom=slam.zoom)
+
     def anew(self, zoom: Zoom) -> OnlineRun:
         """Return a run of the same frames from the beginning, with a zoom undone in their images."""
         self.slam.reset()
@@ -156,9 +164,7 @@ class OnlineRun:
                 return self.end()
             if are_all_processed:
                 return self.end(interrupted=False)
-        sensor, maps = slam.shared_camera.model, tuple(slam.session.atlas)
-        results, skipped = list(so_far.results), list(so_far.skipped)
-        return Run(maps, sensor, slam.config, results, skipped, False, failure="", read_zoom=slam.zoom)
+        return self.begun
 
     def _process(self, frames: Frames, until_lost: bool) -> bool:
         """Process the frames that are left, with `until_lost` up to one in which tracking was lost; were these all?"""
