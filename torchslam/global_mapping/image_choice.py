@@ -14,7 +14,8 @@ from torchslam.types import FrameFeatures, State, StepResult
 
 LEAST_SHARED, HALVINGS = 200, 2
 """Verified matches that neighbors must have, or else a frame between them is mapped as well, and how often the distance
-is halved so at most. Keyframes of machine_hall have 637 in the median, those of office_loop, mapped alone, lose its loop."""
+is halved so at most. Keyframes of machine_hall have 637 in the median, those of office_loop, mapped alone, lose its
+loop."""
 ENOUGH_SHARED = 400
 """Verified matches of neighbors from which on frames or keyframes between them are left out. With 200 the error of
 garden doubles; tried at these two values."""
@@ -62,7 +63,7 @@ def choose_images(count: int, results: Rows[StepResult], most: int) -> list[int]
 def overlapping_views(
     images: list[int], read: Callable[[list[int]], list[FrameFeatures]], match: Neighbors
 ) -> list[FrameFeatures]:
-    """The views of every few of the images, and of those, or of frames, between neighbors with too few verified matches.
+    """The views of every few of the images, and those between neighbors that have too few verified matches.
 
     Args:
         images: frames, ascending.
