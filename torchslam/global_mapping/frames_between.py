@@ -30,9 +30,6 @@ NUM_NEAREST = 3  # keyframes in time for the relocalization of a lost frame
 WINDOW_PX, LEVELS = 21, 3
 """Side of the window that is followed, in pixels of the images in which features are found, and levels of the pyramid
 above the first: OpenCV's defaults."""
-MOST_ITERATIONS, LAST_STEP_PX = 10, 0.03
-"""Iterations of the flow on each level of the pyramid, and the step below which they end. With OpenCV's defaults, 30
-and 0.01, the flow takes 1.8 times as long. Tried at these two pairs of values."""
 MOST_APART_PX = 1.0
 """Distance up to which a keypoint that is followed to an image and back arrives where it began. Tried at this value
 only."""
@@ -85,7 +82,6 @@ class Template:
             cv2.calcOpticalFlowPyrLK,
             winSize=(WINDOW_PX, WINDOW_PX),
             maxLevel=LEVELS,
-            criteria=(cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, MOST_ITERATIONS, LAST_STEP_PX),
             flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
         )
         last = begin
