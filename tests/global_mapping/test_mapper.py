@@ -5,6 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Iterable
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
@@ -259,6 +260,26 @@ def test_doubtful_frames_of_an_online_run_are_mapped() -> None:
     made = map_whole(Counting(walk_arc(30)), results=[result(7, State.LOST), result(8, State.TRACKING)])
     assert [view.index for view in made.views] == [0, 2, 4, 6, 7, *range(8, 30, 2)]
     assert sorted(Counting.read) == list(range(30))
+
+
+def test_pairs_that_the_choice_of_images_matched_are_not_matched_again(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    tried = list[tuple[int, int]]()
+    match = PairMatcher.match
+
+    def counted(matcher: PairMatcher, pairs: Iterable[tuple[int, int]]) -> list[ViewPair]:
+        ends = list(pairs)
+        tried.extend((matcher.views[one].index, matcher.views[other].index) for one, other in ends)
+        return match(matcher, ends)
+
+    monkeypatch.setattr(PairMatcher, "match", counted)
+    made = map_whole(WALK)
+    assert len(tried) == len(set(tried))
+    frames = [view.index for view in made.views]
+    assert set(pairwise(frames)) <= set(tried)
+    ends = [(frames[pair.first], frames[pair.second]) for pair in made.pairs]
+    assert len(ends) == len(set(ends))
 
 
 def test_progress_names_the_stages() -> None:

@@ -197,6 +197,9 @@ class GlobalMapper:
         self.processes = processes
         self.skipped: list[str] = []
         self.readout: Readout | None = None  # by which the keypoints of images are corrected
+        self._tried: dict[
+            tuple[int, int], ViewPair | None
+        ] = {}  # pairs of frames that were matched, if they held
 
     @torch.no_grad()
     def run(
@@ -217,13 +220,17 @@ class GlobalMapper:
                 "global_mapping.learned_links requires images; the recording has precomputed features"
             )
         images = choose_images(len(self.sequence), results, self.config.global_mapping.window_images)
+        self._tried.clear()
         views = overlapping_views(images, self._saved_views, self._neighbors)
         if before is not None:
             views, self.readout = before.at_middle_row(views), before.readout
+        if self.readout is not None:  # keypoints are elsewhere now
+            self._tried.clear()
         if len(views) < MIN_VIEWS:
             return self._failed(f"no map: {len(views)} images are too few", views, [])
         matcher = PairMatcher(views, self.camera, self.matcher, self.config)
-        pairs = build_view_graph(matcher, partial(self.progress, "matches"), self.saved.pairs)
+        pairs = build_view_graph(matcher, partial(self.progress, "matches"), self._matched)
+        self._tried.clear()
         return_freed_memory()
         held_back = choose_held_back(pairs)
         used = [pair for row, pair in enumerate(pairs) if row not in held_back]
@@ -438,7 +445,16 @@ class GlobalMapper:
     def _neighbors(self, views: list[FrameFeatures], rows: list[int]) -> list[ViewPair]:
         """The pairs of views and the next ones that hold, of some rows."""
         matcher = PairMatcher(views, self.camera, self.matcher, self.config)
-        return self.saved.pairs(matcher, ((row, row + 1) for row in rows))
+        return self._matched(matcher, [(row, row + 1) for row in rows])
+
+    def _matched(self, matcher: PairMatcher, pairs: Iterable[tuple[int, int]]) -> list[ViewPair]:
+        """The pairs that hold, in the given order; those that were tried before are not matched again."""
+        frames = {ends: (matcher.views[ends[0]].index, matcher.views[ends[1]].index) for ends in pairs}
+        new = {ends: key for ends, key in frames.items() if key not in self._tried}
+        held = {(pair.first, pair.second): pair for pair in self.saved.pairs(matcher, new)}
+        self._tried |= {key: held.get(ends) for ends, key in new.items()}
+        found = ((ends, self._tried[key]) for ends, key in frames.items())
+        return [replace(pair, first=ends[0], second=ends[1]) for ends, pair in found if pair is not None]
 
     def _saved_views(self, images: list[int]) -> list[FrameFeatures]:
         """The features of the images that can be read, saved in groups."""

@@ -256,10 +256,10 @@ def build_view_graph(
     held = {pair.first for pair in pairs if pair.second - pair.first == NEAR[-1]}
     for done, distance in enumerate(far, len(groups)):
         progress(done, steps)
-        rows = held
+        firsts = held
         if distance < FAR:
-            rows = held | {row for row in range(count) if apart & set(range(row, row + distance))}
-        found = find((row, row + distance) for row in sorted(rows) if row + distance < count)
+            firsts = held | {row for row in range(count) if apart & set(range(row, row + distance))}
+        found = find((row, row + distance) for row in sorted(firsts) if row + distance < count)
         pairs += found
         held = {pair.first for pair in found}
     progress(steps - 1, steps)
