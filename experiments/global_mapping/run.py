@@ -35,7 +35,8 @@ from torchslam.data.trajectories import nearest, write_trajectory
 from torchslam.errors import TrajectoryError
 from torchslam.evaluation import MIN_POSES, evaluate
 from torchslam.geometry import umeyama
-from torchslam.global_mapping.recording import MappedRun, Mapping, map_recording
+from torchslam.global_mapping.recording import MappedRun, Mapping, run_recording
+from torchslam.system.online_run import OnlineRun
 from torchslam.system.run import Run
 from torchslam.system.slam import SLAM
 from torchslam.types import Trajectory
@@ -112,7 +113,7 @@ def attempt(case: Columns) -> Columns:
 
 
 def mapped(case: Columns, folder: Path) -> list[Columns]:
-    """Run online, then map as a whole; writes the trajectories and returns the outcome of either mapping."""
+    """Map frame by frame, and as a whole; writes the trajectories and returns the outcome of either mapping."""
     device = torch.device("cpu")
     start = time.process_time()
     sequence = open_sequence(
@@ -122,12 +123,11 @@ def mapped(case: Columns, folder: Path) -> list[Columns]:
     if sequence.calibrated is not Calibrated.GIVEN:
         sequence, _ = find_camera(sequence, config, folder, device)
     config = with_stated_std(config, sequence)
-    online = SLAM(sequence.camera, config).run(sequence)
     before = time.process_time() - start
     outcomes = []
     for mode in MODES:
         start = time.process_time()
-        made = map_recording(sequence, online, config, sequence.camera, mode)
+        made = run_recording(OnlineRun(SLAM(sequence.camera, config), sequence), sequence, mode)
         seconds = before + time.process_time() - start
         if not made.failure:
             write_trajectory(folder / f"{mode.value}.txt", made.trajectory)
