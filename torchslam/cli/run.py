@@ -256,7 +256,8 @@ def run(sequence: Sequence, config: Config, options: argparse.Namespace) -> int:
     for warning in result_warnings(metrics):
         warn(warning)
     if finished.interrupted:
-        say("interrupted; the results so far were written")
+        goes_on = any((options.output / name).exists() for name in (CHECKPOINT, STAGES))
+        say("interrupted; the results so far were written" + ("; --resume goes on" if goes_on else ""))
         return stop_signals.status
     delete_unfinished(options.output)
     if finished.failure:
@@ -292,7 +293,8 @@ def _begin(sequence: Sequence, config: Config, options: argparse.Namespace) -> t
         say(f"resuming at frame {so_far.next} of {sequence.known_length}")
         return slam, so_far
     if options.resume:
-        say("no checkpoint to resume from; starting with the first frame")
+        saved = "; global mapping goes on with what it saved" if (options.output / STAGES).is_dir() else ""
+        say(f"no checkpoint to resume from; starting with the first frame{saved}")
     if options.map is None:
         return SLAM(sequence.camera.to(options.device), config), RunProgress()
     slam = SLAM.load(options.map, config, mapping=not options.localize, device=options.device)
