@@ -304,7 +304,7 @@ def test_progress_names_the_stages() -> None:
         "final adjustment",
     ]
     assert [call[1:] for call in calls if call[0] == "features"] == [(done, 15) for done in range(15)]
-    assert {call[1:] for call in calls if call[0] == "matches"} == {(done, 4) for done in range(4)}
+    assert {call[1:] for call in calls if call[0] == "matches"} == {(done, 2) for done in range(2)}
     assert {done for stage, done, _ in calls if stage == "frames between"} == set(range(30))
     assert sum("agree" in stage for stage, _, _ in calls) > len(COARSE)
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable
-from collections.abc import Sequence as Rows
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -347,25 +346,6 @@ def test_neighbors_are_tried_at_a_few_distances(count: int, distances: list[int]
     ends = [(pair.first, pair.second) for pair in pairs]
     assert ends == sorted(set(matcher.asked))
     assert len(matcher.asked) == len(ends)
-
-
-@pytest.mark.usefixtures("_without_places")
-@pytest.mark.parametrize(
-    ("blurred", "more_5", "more_8"), [(None, [], []), (20, range(15, 21), range(12, 21))]
-)
-def test_farther_pairs_are_tried_where_nearer_ones_held_or_the_chain_is_broken(
-    blurred: int | None, more_5: Rows[int], more_8: Rows[int]
-) -> None:
-    """At 5 after 3, at 8 after 5, and across a blurred image."""
-    held = {3: [4, 9], 5: [9]}
-
-    def holds(first: int, second: int) -> bool:
-        near = second - first < 3 or first in held.get(second - first, [])
-        return near and blurred not in (first, second)
-
-    matcher = FakeMatcher(31, holds)
-    build_view_graph(matcher)
-    assert [matcher.firsts(distance) for distance in (5, 8)] == [[4, 9, *more_5], [9, *more_8]]
 
 
 @pytest.mark.usefixtures("_without_places")

@@ -26,13 +26,11 @@ from torchslam.tracking.matcher import DescriptorMatcher, max_distance, run_matc
 from torchslam.types import FrameFeatures, Matcher, MatchIndices
 from torchslam.utils.indexing import connected_parts
 
-NEAR = 1, 2, 3
-"""Distances in images at which all neighbors in time are matched."""
-FARTHER, FAR = (5, 8), 16
-"""Distances at which neighbors are matched where those at the distance before held, or where direct neighbors between
-them did not: a blurred image breaks no chain. From `FAR` on, doubling, only where those at the distance before held.
-On garden all of 1 to 8 give the same poses, for half more time. On courthouse 218 of 1,776 pairs are not matched for
-the condition at 5 and 8, and as many hold."""
+NEAR = 1, 2, 3, 5, 8
+"""Distances in images at which all neighbors in time are matched: a blurred image breaks no chain. On garden all of 1
+to 8 give the same poses, for half more time."""
+FAR = 16
+"""Distance from which on, doubling, neighbors are matched where those at the distance before held."""
 PLACES = 2
 """Images of similar places that each image is matched with, beyond its neighbors in time."""
 MIN_MATCHES = 20
@@ -243,8 +241,7 @@ def build_view_graph(
     """
     find = partial(match, matcher) if match else matcher.match
     count = len(matcher.views)
-    doubling = (FAR << doubled for doubled in range(count.bit_length()))
-    far = [distance for distance in (*FARTHER, *doubling) if distance < count]
+    far = [FAR << doubled for doubled in range(count.bit_length()) if FAR << doubled < count]
     groups = range(0, count, _IMAGES_AT_ONCE)
     steps = len(groups) + len(far) + 1
     pairs: list[ViewPair] = []
@@ -252,16 +249,12 @@ def build_view_graph(
         progress(done, steps)
         rows = range(start, min(start + _IMAGES_AT_ONCE, count))
         pairs += find((row, row + distance) for row in rows for distance in NEAR if row + distance < count)
-    apart = set(range(count)) - {pair.first for pair in pairs if pair.second - pair.first == NEAR[0]}
-    held = {pair.first for pair in pairs if pair.second - pair.first == NEAR[-1]}
+    held = [pair.first for pair in pairs if pair.second - pair.first == NEAR[-1]]
     for done, distance in enumerate(far, len(groups)):
         progress(done, steps)
-        firsts = held
-        if distance < FAR:
-            firsts = held | {row for row in range(count) if apart & set(range(row, row + distance))}
-        found = find((row, row + distance) for row in sorted(firsts) if row + distance < count)
+        found = find((row, row + distance) for row in held if row + distance < count)
         pairs += found
-        held = {pair.first for pair in found}
+        held = [pair.first for pair in found]
     progress(steps - 1, steps)
     known = {(pair.first, pair.second) for pair in pairs}
     pairs += find(pair for pair in similar_places(matcher.views) if pair not in known)
