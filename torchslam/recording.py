@@ -34,8 +34,8 @@ def run(
         sequence: the recording, as of `open_sequence`. An unknown camera is estimated from pairs of its images.
         config: the configuration; the default one if None.
         mapping: "auto": frame by frame, and then as a whole if frames were lost or held-out image pairs contradict the
-            map; "online": frame by frame alone; "global": as a whole in any case, and only then frame
-            by frame, where that map is not right.
+            map; "online": frame by frame alone; "global": as a whole in any case, and frame by frame
+            before where the recording is long, or after where that map is not right.
         measurements: sources of meters, beside those of `config.metric` and those that the sequence brings along.
         processes: number of processes, this one included; None: the best number. The result is the same.
         observer: sees the progress, and ends the run by raising KeyboardInterrupt: what there is is returned.

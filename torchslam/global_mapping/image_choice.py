@@ -28,10 +28,10 @@ Neighbors = Callable[[list[FrameFeatures], list[int]], list[ViewPair]]
 """Finds, of some rows of views, the pairs with the next view that hold."""
 
 
-def needs_keyframes(count: int, most: int) -> bool:
-    """Whether frames of a recording of so many that are spread evenly, at most so many, may miss what they overlap in.
+def needs_keyframes(count: float, most: int) -> bool:
+    """Whether a recording has so many frames that `most` of them, spread evenly, may be too far apart to overlap.
 
-    With every frame between neighbors that `overlapping_views` may add, shorter ones have all that there is.
+    In a shorter one `overlapping_views` can add every frame between them.
     """
     return count > most << HALVINGS
 

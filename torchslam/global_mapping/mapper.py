@@ -197,9 +197,8 @@ class GlobalMapper:
         self.processes = processes
         self.skipped: list[str] = []
         self.readout: Readout | None = None  # by which the keypoints of images are corrected
-        self._tried: dict[
-            tuple[int, int], ViewPair | None
-        ] = {}  # pairs of frames that were matched, if they held
+        # Pairs of frames that the choice of images matched; None for those that do not hold.
+        self._tried: dict[tuple[int, int], ViewPair | None] = {}
 
     @torch.no_grad()
     def run(

@@ -59,7 +59,7 @@ class Mapping(StrEnum):
     ONLINE = "online"
     """Frame by frame, in the order of time."""
     GLOBAL = "global"
-    """As a whole, and online first where the recording is long, or then where that map is not right."""
+    """As a whole, and online before where the recording is long, or after where that map is not right."""
 
 
 @dataclass(frozen=True)
@@ -165,18 +165,12 @@ def _mapped(
     may_end: whether a zoom that is found in the frames ends it
     """
     config, observer = online.slam.config, online.observer
-    length, most = sequence.known_length, config.global_mapping.window_images
-    if (
-        mapping is Mapping.GLOBAL
-        and length is not None
-        and not needs_keyframes(length, most)
-        and not all_frames
-    ):
-        begun = online.begun
+    known, most = sequence.known_length, config.global_mapping.window_images
+    length = math.inf if known is None or all_frames else known  # of frames that may be left out
+    if mapping is Mapping.GLOBAL and not needs_keyframes(length, most):
+        run = MappedRun.of(online.begun)
     else:
-        are_all_mapped = mapping is Mapping.AUTO and length is not None and length <= most
-        begun = online.run(until_lost=are_all_mapped and not all_frames)
-    run = MappedRun.of(begun)
+        run = MappedRun.of(online.run(until_lost=mapping is Mapping.AUTO and length <= most))
     if mapping is None or run.interrupted or (may_end and _is_zoomed(run)):
         return run
     go_on = None if online.is_finished else online.run

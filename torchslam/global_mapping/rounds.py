@@ -202,8 +202,8 @@ def adjust(
 ) -> Reconstruction:
     """Adjust poses and points, and the camera with its prior if given, by the observations that agree.
 
-    In float32, relative to the middle of the cameras, which a path of 5,000 depths changes by a fifth of a pixel: the
-    final adjustment is in float64, and begins where this ends.
+    In float32, relative to the middle of the cameras: over a path of 5,000 depths, rounding moves a projection by a
+    fifth of a pixel. The final adjustment, in float64, begins where this ends.
     """
     tracks, former = observed.tracks.select(found.agrees)
     rows = found.agrees & torch.isin(observed.tracks.track, former)
@@ -229,7 +229,7 @@ def adjust(
         ),
     )
     T_cw, camera = solution.T_cw.to(found.T_cw), solution.camera.to(found.camera.params)
-    # Rotations are so only to float32, which an inverse that is a transpose would multiply.
+    # They are rotations only to the rounding of float32.
     R_cw = matrix_from_quaternion(quaternion_from_matrix(T_cw[:, :3, :3]))
     T_cw = rigid(R_cw, T_cw[:, :3, 3]) @ se3_inverse(middle_w)
     points_w = found.points_w.clone()
