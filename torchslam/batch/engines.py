@@ -9,6 +9,7 @@ import os
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -68,10 +69,6 @@ def _map_with_ray(
     work: Work, items: list[Columns], workers: int | None, address: str | None, gpus: int
 ) -> Iterator[tuple[int, Columns | None]]:
     """Run `Engine.map_unordered` as Ray tasks of one row and one processor each."""
-
-    def on_item(item: Columns) -> Columns:
-        return {"number": item["number"], "row": json.dumps(work(json.loads(item["row"])))}
-
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # otherwise it reports each cluster to its makers
     try:
         ray, data = importlib.import_module("ray"), importlib.import_module("ray.data")
@@ -85,7 +82,7 @@ def _map_with_ray(
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # max_retries is deprecated in Ray 2.64, without a replacement
             done = data.from_items(items, override_num_blocks=len(items)).map(
-                on_item,
+                partial(_done, work),
                 num_cpus=1,
                 num_gpus=gpus or None,
                 max_retries=RETRIES,
@@ -98,6 +95,10 @@ def _map_with_ray(
             yield number, None
     finally:
         ray.shutdown()
+
+
+def _done(work: Work, item: Columns) -> Columns:
+    return {"number": item["number"], "row": json.dumps(work(json.loads(item["row"])))}
 
 
 def _start(ray: Any, workers: int | None, address: str | None) -> None:
