@@ -90,9 +90,8 @@ def test_large_images_are_not_cached(tmp_path: Path) -> None:
     cv2.imwrite(str(tmp_path / "0.png"), np.full((side, side), 1000, np.uint16))
     for index in range(1, 22):
         os.link(tmp_path / "0.png", tmp_path / f"{index}.png")
-    open_sequence(
-        tmp_path, "1000,1000,1023.5,1023.5"
-    )  # what a first call loads for good, 23 MB, is not measured
+    # What a first call loads for good, 23 MB, is not measured.
+    open_sequence(tmp_path, "1000,1000,1023.5,1023.5")
     Path("/proc/self/clear_refs").write_text("5")
     before = resident("VmRSS")
     sequence = open_sequence(tmp_path, "1000,1000,1023.5,1023.5")

@@ -534,10 +534,8 @@ def test_a_part_that_nothing_ties_to_the_map_is_lost() -> None:
     # A scene around the walk only, not around the distance between both parts.
     scene = Simulated(settings, walk.camera, se3_inverse(T_wc[:20]))
     made = GlobalMapper(scene.of(walk), walk.camera, settings, None).run()
-    assert [view.index for view in made.views] == [
-        *range(0, 20, 2),
-        *range(19, 25),
-    ]  # all where they do not overlap
+    # All where they do not overlap.
+    assert [view.index for view in made.views] == [*range(0, 20, 2), *range(19, 25)]
     assert len(made.run.trajectory) == 20
     assert made.run.map.num_keyframes == 11
     assert [each.state for each in made.run.results] == [State.TRACKING] * 20 + [State.LOST] * 6

@@ -80,6 +80,8 @@ SAVED_TOGETHER = 50
 """Images whose features are saved in one file of up to 80 MB. As many, some seconds of work, are lost if a run is
 killed. Tried at this value only."""
 
+Tried = dict[tuple[int, int], ViewPair | None]
+"""The pairs of frames that were matched, None for those that do not hold."""
 Progress = Callable[[str, int, int], None]
 """Called with the name of a stage, what is done of it, and all that is to be done."""
 
@@ -197,8 +199,6 @@ class GlobalMapper:
         self.processes = processes
         self.skipped: list[str] = []
         self.readout: Readout | None = None  # by which the keypoints of images are corrected
-        # Pairs of frames that the choice of images matched; None for those that do not hold.
-        self._tried: dict[tuple[int, int], ViewPair | None] = {}
 
     @torch.no_grad()
     def run(
@@ -219,17 +219,16 @@ class GlobalMapper:
                 "global_mapping.learned_links requires images; the recording has precomputed features"
             )
         images = choose_images(len(self.sequence), results, self.config.global_mapping.window_images)
-        self._tried.clear()
-        views = overlapping_views(images, self._saved_views, self._neighbors)
+        tried: Tried = {}
+        views = overlapping_views(images, self._saved_views, partial(self._neighbors, tried))
         if before is not None:
             views, self.readout = before.at_middle_row(views), before.readout
         if self.readout is not None:  # keypoints are elsewhere now
-            self._tried.clear()
+            tried.clear()
         if len(views) < MIN_VIEWS:
             return self._failed(f"no map: {len(views)} images are too few", views, [])
         matcher = PairMatcher(views, self.camera, self.matcher, self.config)
-        pairs = build_view_graph(matcher, partial(self.progress, "matches"), self._matched)
-        self._tried.clear()
+        pairs = build_view_graph(matcher, partial(self.progress, "matches"), partial(self._matched, tried))
         return_freed_memory()
         held_back = choose_held_back(pairs)
         used = [pair for row, pair in enumerate(pairs) if row not in held_back]
@@ -441,18 +440,20 @@ class GlobalMapper:
             read_zoom=self.sequence.zoom,
         )
 
-    def _neighbors(self, views: list[FrameFeatures], rows: list[int]) -> list[ViewPair]:
+    def _neighbors(self, tried: Tried, views: list[FrameFeatures], rows: list[int]) -> list[ViewPair]:
         """The pairs of views and the next ones that hold, of some rows."""
         matcher = PairMatcher(views, self.camera, self.matcher, self.config)
-        return self._matched(matcher, [(row, row + 1) for row in rows])
+        return self._matched(tried, matcher, [(row, row + 1) for row in rows])
 
-    def _matched(self, matcher: PairMatcher, pairs: Iterable[tuple[int, int]]) -> list[ViewPair]:
+    def _matched(
+        self, tried: Tried, matcher: PairMatcher, pairs: Iterable[tuple[int, int]]
+    ) -> list[ViewPair]:
         """The pairs that hold, in the given order; those that were tried before are not matched again."""
         frames = {ends: (matcher.views[ends[0]].index, matcher.views[ends[1]].index) for ends in pairs}
-        new = {ends: key for ends, key in frames.items() if key not in self._tried}
+        new = {ends: key for ends, key in frames.items() if key not in tried}
         held = {(pair.first, pair.second): pair for pair in self.saved.pairs(matcher, new)}
-        self._tried |= {key: held.get(ends) for ends, key in new.items()}
-        found = ((ends, self._tried[key]) for ends, key in frames.items())
+        tried |= {key: held.get(ends) for ends, key in new.items()}
+        found = ((ends, tried[key]) for ends, key in frames.items())
         return [replace(pair, first=ends[0], second=ends[1]) for ends, pair in found if pair is not None]
 
     def _saved_views(self, images: list[int]) -> list[FrameFeatures]:

@@ -245,10 +245,11 @@ def map_recording(
     if mapping is Mapping.AUTO and stands_still(online.results):
         return MappedRun.of(online, Mapping.ONLINE)
     check, camera = None, camera.to(device)
-    why = _loss(online)
-    if go_on is not None:
-        was_lost = mapping is not Mapping.GLOBAL
-        why = f"tracking was lost at frame {online.results[-1].index}" if was_lost else ASKED_FOR
+    if go_on is None:
+        why = _loss(online)
+    else:
+        is_lost = mapping is not Mapping.GLOBAL
+        why = f"tracking was lost at frame {online.results[-1].index}" if is_lost else ASKED_FOR
     is_long = len(online.results) > config.global_mapping.window_images
     if not why or mapping is Mapping.ONLINE or is_long:
         progress("check", 0, 1)

@@ -202,8 +202,9 @@ def adjust(
 ) -> Reconstruction:
     """Adjust poses and points, and the camera with its prior if given, by the observations that agree.
 
-    In float32, relative to the middle of the cameras: over a path of 5,000 depths, rounding moves a projection by a
-    fifth of a pixel. The final adjustment, in float64, begins where this ends.
+    In float32, relative to the middle of the cameras: at the ends of a path 5,000 times as long as points are far, with
+    a focal length of 600 px, rounding moves projections by .06 px in the median. The final adjustment, in float64,
+    begins where this ends.
     """
     tracks, former = observed.tracks.select(found.agrees)
     rows = found.agrees & torch.isin(observed.tracks.track, former)
